@@ -856,7 +856,7 @@ class Constraints:
 
     def _measure(
         self, joined: Joined
-    ) -> tuple[Float[Tensor, "batch points 3"], Float[Tensor, "batch faced 1"], Float[Tensor, "batch points 2"]]:
+    ) -> tuple[Float[Tensor, "batch targets 3"], Float[Tensor, "batch faced 1"], Float[Tensor, "batch points 2"]]:
         """Measure by how much motions miss positions, headings and points of the trajectory, metres."""
         root = joined.root_position
         positions, _ = forward_kinematics(CANONICAL.offsets.to(root), CANONICAL.parents, root, joined.quats)

@@ -96,7 +96,7 @@ class StepRecord:
     frames: int
     """Number of frames delivered."""
     asked: float
-    """Second of the stream at which the source was requested a command."""
+    """Second of the stream at which the command was read."""
     due: float
     """Second of the stream at which the first of the frames was due."""
     delivered: float

@@ -25,16 +25,16 @@ MAX_FITTED_DISTANCE = 4.0
 _GAIT_CUES = ("step", "stride", "lift", "hips", "toes", "knees", "arms", "lean")
 PAIR_FEATURES = (
     "one",
-    "way",
+    "distance",
     "apart",
     "worst",
     "turned",
-    "way2",
-    "way_apart",
+    "distance2",
+    "distance_apart",
     "aside",
     "ahead",
     *_GAIT_CUES,
-    *(f"way_{name}" for name in _GAIT_CUES),
+    *(f"distance_{name}" for name in _GAIT_CUES),
 )
 """Names of a pair's features, in the order of `compute_pair_features`."""
 _MIN_POSE_DISTANCE = 0.03  # metres, added to the distance of two poses so that tiny ones do not matter

@@ -198,7 +198,7 @@ SEEN_FRAMES = 30
 """Frames of a run that the critic sees."""
 
 
-class FreeRunJudge:
+class CriticTrainer:
     """The critic, its optimiser, and the free runs that it has been shown."""
 
     def __init__(self, windows: FeatureWindows, *, seed: int):
@@ -269,10 +269,10 @@ class FreeRunCritic(nn.Module):
         self.last = nn.Linear(2 * _WIDTH, 1)
 
     def standardise(self, rows: Float[Tensor, "batch frames rows"]) -> Float[Tensor, "batch frames rows"]:
-        """Put rows into the units that `judge` takes."""
+        """Put rows into the units that `score_standardised` takes."""
         return (rows - self.mean) / self.std
 
-    def judge(self, standard: Float[Tensor, "batch frames rows"]) -> Float[Tensor, " batch"]:
+    def score_standardised(self, standard: Float[Tensor, "batch frames rows"]) -> Float[Tensor, " batch"]:
         """Return the logits that windows were captured; by the mean over time and by the worst moment."""
         hidden = standard.transpose(1, 2)
         for layer in self.layers:
@@ -281,7 +281,7 @@ class FreeRunCritic(nn.Module):
 
     def forward(self, rows: Float[Tensor, "batch frames rows"]) -> Float[Tensor, " batch"]:
         """Return the logits that windows of what `show` returns were captured."""
-        return self.judge(self.standardise(rows))
+        return self.score_standardised(self.standardise(rows))
 
 
 def show(features: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch frames_less_one rows"]:
@@ -309,7 +309,7 @@ def compute_generator_loss(generated: Float[Tensor, " batch"]) -> Tensor:
 def compute_gradient_penalty(critic: FreeRunCritic, real: Float[Tensor, "batch frames rows"]) -> Tensor:
     """Mean squared slope of the critic at captured motion (R1 of Mescheder et al. 2018), by standard deviations."""
     standard = critic.standardise(real).detach().requires_grad_()
-    (slope,) = torch.autograd.grad(critic.judge(standard).sum(), standard, create_graph=True)
+    (slope,) = torch.autograd.grad(critic.score_standardised(standard).sum(), standard, create_graph=True)
     return slope.square().flatten(1).sum(dim=1).mean()
 
 

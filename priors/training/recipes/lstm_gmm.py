@@ -34,7 +34,7 @@ from priors.training.critics import (
     FREE_RUN_MOMENTS,
     HISTORY,
     SEEN_FRAMES,
-    FreeRunJudge,
+    CriticTrainer,
     HistoryBuffer,
     moment_loss,
     run_free,
@@ -164,13 +164,13 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         self.windows = FeatureWindows(corpus, settings.window + 1, standing_share=settings.standing_share)
         self._latest = corpus.features[:0], self.labels.held[:0]  # windows of the step under way, and their labels
         self.begin()
-        self.judge: FreeRunJudge | None = None
+        self.critic_trainer: CriticTrainer | None = None
         self.average = self.network
         """Moving average of the weights since the critic joined, the weights themselves without one."""
         if settings.critic_steps:
             if count_processes()[1] > 1:
                 raise RequestError("a density is trained with a critic by one process")
-            self.judge = FreeRunJudge(self.windows, seed=settings.seed)
+            self.critic_trainer = CriticTrainer(self.windows, seed=settings.seed)
             self.average = copy.deepcopy(self.network).requires_grad_(False)
 
     @property
@@ -180,12 +180,16 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
 
     def networks(self) -> dict[str, nn.Module]:
         """All that is learnt, by its name in checkpoints."""
-        critic = {} if self.judge is None else {"average": self.average, "critic": self.judge.network}
+        critic = (
+            {} if self.critic_trainer is None else {"average": self.average, "critic": self.critic_trainer.network}
+        )
         return {"model": self.network, **critic}
 
     def optimisers(self) -> dict[str, torch.optim.Optimizer]:
         """One for each of the two that contend."""
-        return super().optimisers() | ({} if self.judge is None else {"critic-optimiser": self.judge.optimiser})
+        return super().optimisers() | (
+            {} if self.critic_trainer is None else {"critic-optimiser": self.critic_trainer.optimiser}
+        )
 
     def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
         """Make AdamW."""
@@ -198,27 +202,27 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
 
     def state(self) -> dict[str, Tensor]:
         """Return everything that a continuation needs, but the step."""
-        history = None if self.judge is None else self.judge.history
+        history = None if self.critic_trainer is None else self.critic_trainer.history
         return super().state() | ({} if history is None else {"history": history.windows})
 
     def load_state(self, tensors: Mapping[str, Tensor], step: int) -> None:
         """Go on from what `state` returned; KeyError or RuntimeError where it is not whole."""
         super().load_state(tensors, step)
-        if self.judge is not None and "history" in tensors:
-            self.judge.history = HistoryBuffer(tensors["history"].to(self.windows.features.device))
+        if self.critic_trainer is not None and "history" in tensors:
+            self.critic_trainer.history = HistoryBuffer(tensors["history"].to(self.windows.features.device))
 
     def train_step(self) -> dict[str, float]:
         """One update, and those of the critic where it has joined: `critic` is its loss, 1.39 where it has learnt
         nothing, `accuracy` the share of windows that it classifies correctly."""
-        if self.judge is not None and self._criticised == 0:
-            self._introduce(self.judge)
+        if self.critic_trainer is not None and self._criticised == 0:
+            self._introduce(self.critic_trainer)
         parts = super().train_step()
-        if self.judge is None:
+        if self.critic_trainer is None:
             return parts
-        if self.judge.history is None:
+        if self.critic_trainer.history is None:
             self.average.load_state_dict(self.network.state_dict())
             return {**parts, **_UNTAUGHT}
-        parts |= self.judge.learn(self.step, _CRITIC_UPDATES, self.generator)
+        parts |= self.critic_trainer.learn(self.step, _CRITIC_UPDATES, self.generator)
         update_average(self.average, self.network, min(_AVERAGE, self._criticised / (self._criticised + 20)))
         return parts
 
@@ -230,10 +234,10 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
     def limit_gradients(self) -> None:
         """Clip, and add the gradient of free runs where it is time for it."""
         nn.utils.clip_grad_norm_(self.network.parameters(), _GRADIENT_CLIP)
-        joined = self.judge is not None and self._criticised >= 0
+        joined = self.critic_trainer is not None and self._criticised >= 0
         begun = self.step >= _MATCH_FROM * (self.steps - self.settings.critic_steps)
         if self._criticised % _CRITIC_EVERY == 0 if joined else begun and self.step % _MATCH_EVERY == 0:
-            self._add_free_run_gradients(self.judge if joined else None)
+            self._add_free_run_gradients(self.critic_trainer if joined else None)
 
     def compute_learning_rate(self) -> float:
         """Compute that of the current step."""
@@ -287,15 +291,15 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         return self.step - self.steps + self.settings.critic_steps
 
     @torch.no_grad()
-    def _introduce(self, judge: FreeRunJudge) -> None:
+    def _introduce(self, critic_trainer: CriticTrainer) -> None:
         """Show free runs to the critic, and let it learn before the density is trained by it."""
         self.average.load_state_dict(self.network.state_dict())
         runs: list[Tensor] = []
         while sum(map(len, runs)) < HISTORY:
             runs.append(self._run_free(*self.draw_windows())[0])
-        judge.fill(torch.cat(runs)[:HISTORY])
+        critic_trainer.fill(torch.cat(runs)[:HISTORY])
         with torch.enable_grad():
-            judge.learn(self.step, _CRITIC_HEAD_START, self.generator)
+            critic_trainer.learn(self.step, _CRITIC_HEAD_START, self.generator)
 
     def _run_free(self, windows: Tensor, shown: Tensor) -> tuple[Tensor, Tensor]:
         """Free runs after the first windows, given their paces as the network is in this step, and how these go on.
@@ -307,17 +311,17 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         paces = torch.zeros_like(shown)
         paces[:, self._pace_labels] = shown[:, self._pace_labels]
         condition = self._make_condition(shown.new_zeros(len(shown), 1), paces)
-        least = SEEN_FRAMES if self.judge is not None else 0
+        least = SEEN_FRAMES if self.critic_trainer is not None else 0
         return run_free(self.network, windows, self.generator, least=least, condition=condition)
 
-    def _add_free_run_gradients(self, judge: FreeRunJudge | None) -> None:
+    def _add_free_run_gradients(self, critic_trainer: CriticTrainer | None) -> None:
         """Add the gradient of the free runs' mismatch, and that of the critic's loss where it has joined, each clipped
         on its own: no loss drowns another."""
         generated, real = self._run_free(*self._latest)
         moments = moment_loss(generated[:, : real.shape[1]], real, FREE_RUN_MOMENTS)
-        self._add_gradient(moments, retain_graph=judge is not None)
-        if judge is not None:
-            self._add_gradient(judge.score(generated, self.generator))
+        self._add_gradient(moments, retain_graph=critic_trainer is not None)
+        if critic_trainer is not None:
+            self._add_gradient(critic_trainer.score(generated, self.generator))
 
     def _add_gradient(self, loss: Tensor, *, retain_graph: bool = False) -> None:
         parameters, processes = [p for p in self.network.parameters() if p.requires_grad], count_processes()[1]
