@@ -1,6 +1,6 @@
 """
 Vary the transition between two poses
-=================================
+=====================================
 
 Many motions lead from one pose to the next. The stitcher generates from both poses until its two sides meet: one mean
 motion, and any number of samples.

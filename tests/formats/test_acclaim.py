@@ -87,12 +87,6 @@ class TestFinding:
         with pytest.raises(FileFormatError, match=r"01_03\.amc: no such file"):
             mapctl.load("01.asf+01_03.amc")
 
-    def test_several_are_named(self, tmp_path):
-        path = pair(1).write(tmp_path, subject="01", take="01_02")
-        (tmp_path / "02.asf").write_text("junk")
-        with pytest.raises(FileFormatError, match=r"beside it: 01\.asf, 02\.asf; name one as 01\.asf\+01_02\.amc"):
-            mapctl.load(path)
-
     @pytest.mark.parametrize("name", [f"{'x' * 300}.amc", f"{'x' * 300}.asf+x.amc", f"a.asf+{'x' * 300}.amc"])
     def test_a_name_that_cannot_be_is_said_to_be_so(self, tmp_path, name):
         (tmp_path / "a.asf").write_text(pair(1).asf())

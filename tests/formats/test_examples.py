@@ -4,11 +4,9 @@ import json
 import re
 
 import make_example
-import pytest
 from helpers import run, walk
 
 import mapctl
-from mapctl.errors import RequestError
 from mapctl.formats import examples
 
 NAME = "example:noisy-walk"
@@ -40,10 +38,3 @@ def test_other_commands_and_rigs_take_it(tmp_path, capsys):
     assert run("convert", tmp_path / "walk.bvh", tmp_path / "onto.bvh", "--rig", NAME) == 0
     assert mapctl.load(tmp_path / "onto.bvh").skeleton.names == mapctl.load(NAME).skeleton.names
     assert mapctl.load(tmp_path / "part.npz").licence == examples.LICENCE
-
-
-def test_an_example_that_there_is_not_is_named_in_one_line(tmp_path, capsys):
-    with pytest.raises(RequestError, match="no example 'run'; there are: noisy-walk"):
-        mapctl.load("example:run")
-    assert run("denoise", "example:run", "-o", tmp_path / "out.bvh") == 2
-    assert capsys.readouterr().err.count("\n") == 1

@@ -1,22 +1,32 @@
-"""Filling gaps on any rig: what is known stays, what stood in a gap does not matter, a true proposal is met."""
+"""Filling gaps on any rig: what is known stays, which proposal is taken, seams, and the root trajectory."""
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import pytest
 import torch
-from captures import error_cm, on_rig
-from helpers import random_motion, walk
-from methods import by_method
+from captures import apart_deg, error_cm, on_rig, swaying, vectors
+from helpers import generator, quat_xyzw, random_motion, tiny_density, walk
+from methods import UNFINISHED, by_method
 from tiny_infiller import tiny_infiller
+from tiny_path import ToldPath, tiny_path
 
-from controllers.inbetweening.infill import infill
-from controllers.inbetweening.proposers import SlerpInbetweener
-from mapctl import retarget, rotations
-from mapctl.inbetweening import PositionImage, ProposedPositions
-from mapctl.inbetweening.missing import MissingMask, restore_observed
+from controllers import retraced
+from controllers.inbetweening.infill import InfillSettings, infill
+from controllers.inbetweening.pipeline import CanonicalClip, take_simpler
+from controllers.inbetweening.proposers import STANDING_STILL, AutoInbetweener, SlerpInbetweener, hold_planted
+from controllers.inbetweening.tween import tween
+from mapctl import contacts, retarget, rotations
+from mapctl.errors import RequestError
+from mapctl.inbetweening import GapQuery, PositionImage, Proposal, ProposedPositions
+from mapctl.inbetweening.missing import MissingMask, interpolate_missing, restore_observed
+from mapctl.inbetweening.query import estimate_contact_logits
+from mapctl.inbetweening.root_trajectory import close_path
+from mapctl.intent.keyframes import Keys
 from mapctl.motion import Motion
-from mapctl.protocols import PositionInfiller
-from mapctl.recording.masks import ALL, Mask
+from mapctl.numerics.smooth_offsets import blend_seams_in_positions, blend_seams_in_rotations
+from mapctl.protocols import Inbetweener, PositionInfiller
+from mapctl.recording.masks import ALL, ROOT, Mask
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, leg_length
 
 RIGS = ("canonical", "bandai", "daz")
@@ -163,3 +173,324 @@ def test_who_stands_with_a_foot_on_a_step_is_not_lifted_off_the_floor():
     assert toes[0] - toes[1] > 0.2
     done = infill(still, SlerpInbetweener(), [Mask(ALL, 20, 40)]).motion
     assert (done.root_position - still.root_position).norm(dim=-1).max() < 0.015
+
+
+TOES = [CANONICAL.index(name) for name in ("leftToes", "rightToes")]
+
+
+class Network(Inbetweener):
+    """Stands for a network: straight lines, along which the body sways aside by so many metres, and one hand waves."""
+
+    def __init__(self, sway=0.0, wave=0.0):
+        self.sway, self.wave = sway, wave
+
+    def propose(self, query, *, generator=None):
+        bump = torch.sin(torch.linspace(0, torch.pi, query.motion.num_frames).double())
+        root, quats = query.motion.root_position.clone(), query.motion.local_quat_xyzw.clone()
+        root[:, 0] += self.sway * query.missing.root * bump
+        shoulder, angle = CANONICAL.index("leftUpperArm"), torch.zeros(len(root), 3).double()
+        angle[:, 2] = self.wave * query.missing.root * bump
+        quats[:, shoulder] = rotations.multiply(quats[:, shoulder], rotations.from_rotation_vector(angle))
+        motion = replace(query.motion, root_position=root, local_quat_xyzw=quats)
+        return Proposal(motion, torch.zeros(query.motion.num_frames, 2), "network")
+
+
+def chosen(motion, start, stop, *, densities=(), network=None, **known):
+    """The query of a motion that lacks frames, and what is proposed for it."""
+    free = torch.zeros(motion.num_frames, dtype=torch.bool)
+    free[start:stop] = True
+    query = CanonicalClip.of(motion, MissingMask(free[:, None].expand(-1, motion.num_joints).clone(), free)).query()
+    query = replace(query, **known)
+    return query, AutoInbetweener(network or Network(), densities).propose(query)
+
+
+def still(frames):
+    motion = walk(2)
+    first = torch.zeros(frames, dtype=torch.long)
+    return replace(motion, root_position=motion.root_position[first], local_quat_xyzw=motion.local_quat_xyzw[first])
+
+
+def test_a_standing_character_stays():
+    motion = still(121)
+    wandering = tiny_infiller(drawn=0.05)
+    done = tween(motion, Keys((0, 120)), AutoInbetweener(wandering, [tiny_density()]))
+    assert [source.by for source in done.sources] == [STANDING_STILL]
+    away = (done.motion.root_position - motion.root_position).norm(dim=-1)
+    assert away.max() < 0.02
+    assert any("standing still" in note for note in done.gap_notes)
+
+
+@pytest.mark.parametrize(
+    ("sway", "frames", "by"), [(0.01, 90, "network"), (0.06, 90, STANDING_STILL), (0.06, 40, "network")]
+)
+def test_who_stands_may_gesture_but_not_wander(sway, frames, by):
+    motion = still(frames + 2)
+    query, answer = chosen(motion, 1, frames + 1, network=Network(sway=sway, wave=1.5))
+    assert [source.by for source in answer.attribute(query)] == [by]
+    hand = CANONICAL.index("leftHand")
+    moved = (answer.motion.joint_positions() - motion.joint_positions())[:, hand].norm(dim=-1)
+    assert (float(moved.max()) > 0.3) == (by == "network")
+
+
+def test_planted_toes_are_held_and_what_is_known_stays():
+    """A walk that slides aside: toes stand where they first stood, or in the middle of where they slid."""
+    motion = walk(60)
+    stands = contacts.detect_contacts(motion.joint_positions()[:, TOES], 30)
+    sliding = torch.arange(60).double()[:, None] * torch.tensor([0.006, 0.0, 0.0]).double()
+    motion = replace(motion, root_position=motion.root_position + sliding)
+    free = torch.ones(60, dtype=torch.bool)
+    free[:12] = False
+    result = hold_planted(motion, stands, free=free, rest_height=torch.full((motion.num_frames, 2), 0.0425))
+    speeds = [each.joint_positions()[:, TOES].diff(dim=0).norm(dim=-1) for each in (motion, result)]
+    held = (stands[1:] & stands[:-1])[12:]
+    assert speeds[0][12:][held].mean() > 0.005
+    assert speeds[1][12:][held].mean() < 0.002  # where legs are stretched, toes go along a little
+    assert torch.equal(result.local_quat_xyzw[:12], motion.local_quat_xyzw[:12])
+    assert torch.equal(result.root_position, motion.root_position)
+
+
+ARM = CANONICAL.indices(("leftUpperArm", "leftLowerArm"))
+
+
+@dataclass(frozen=True, eq=False)
+class Guess(Inbetweener):
+    """Proposes the truth with its arms and legs turned by so much, where they are missing, and claims an error."""
+
+    truth: Motion
+    wrong: float
+    """Radians."""
+    claim: float
+    """Metres."""
+    asked: ClassVar[list[int]] = []
+
+    def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
+        self.asked.append(int(query.missing.frames.sum()))
+        motion = self.truth.resample(30)
+        turn = torch.zeros(motion.num_joints, 3).double()
+        turn[CANONICAL.indices(("leftUpperArm", "rightUpperArm", "leftUpperLeg", "rightUpperLeg")), 0] = self.wrong
+        quats = rotations.multiply(motion.local_quat_xyzw, rotations.from_rotation_vector(turn))
+        quats = torch.where(query.missing.joints[..., None], quats, query.motion.local_quat_xyzw)
+        root = torch.where(query.missing.root[:, None], motion.root_position, query.motion.root_position)
+        result = replace(query.motion, local_quat_xyzw=quats, root_position=root)
+        spread = torch.full((motion.num_frames, motion.num_joints, 2), self.claim)
+        return Proposal(result, estimate_contact_logits(result), "guess", spread=spread)
+
+
+def fill(motion, inbetweener, *masks):
+    """Frames are refined by no MAP stage, so that what is seen is the shrinkage."""
+    return infill(motion, inbetweener, list(masks), settings=InfillSettings(refine=False))
+
+
+def error(result, truth, frames):
+    return float((result.joint_positions() - truth.joint_positions())[frames].norm(dim=-1).mean())
+
+
+def straight(motion, *masks):
+    lost = torch.zeros(motion.num_frames, dtype=torch.bool)
+    for mask in masks:
+        lost[mask.start : mask.stop] = True
+    return interpolate_missing(motion, MissingMask.of_frames(lost, motion.num_joints))
+
+
+@pytest.mark.parametrize("claim", [0.01, 0.3])
+@pytest.mark.parametrize(("start", "stop", "frames"), [(40, 55, 100), (40, 50, 200), (10, 15, 16), (10, 25, 26)])
+def test_a_network_that_is_wrong_is_outweighed_whatever_it_claims(start, stop, frames, claim):
+    """Where it was tested. With 10 frames before and one after as well as within a long clip."""
+    motion = walk(frames)
+    result = fill(motion, Guess(motion, wrong=0.8, claim=claim), Mask(ALL, start, stop))
+    simple = error(straight(motion, Mask(ALL, start, stop)), motion, slice(start, stop))
+    assert error(result.motion, motion, slice(start, stop)) < 1.05 * simple + 0.0015
+    (note,) = result.gap_notes
+    assert "interpolation: the motion is unfamiliar to the guess" in note
+
+
+@pytest.mark.parametrize(("start", "stop", "frames"), [(40, 55, 100), (10, 25, 26)])
+def test_a_network_that_is_right_is_followed(start, stop, frames):
+    motion = walk(frames)
+    result = fill(motion, Guess(motion, wrong=0.0, claim=0.01), Mask(ALL, start, stop))
+    simple = error(straight(motion, Mask(ALL, start, stop)), motion, slice(start, stop))
+    assert error(result.motion, motion, slice(start, stop)) < 0.15 * simple
+    assert "unfamiliar" not in result.gap_notes[0]
+
+
+@pytest.mark.parametrize("fps", [30, 60])
+def test_a_lost_arm_that_both_ends_hold_still_does_not_drop(fps):
+    """All else walks on and is known; the network lowers the arm, and is as sure as ever."""
+    motion = walk(4 * fps, fps=fps)
+    quats = motion.local_quat_xyzw.clone()
+    quats[:, ARM] = rotations.from_rotation_vector(torch.tensor([0.0, 0.9, 0.3]).double())
+    motion = replace(motion, local_quat_xyzw=quats)
+    gap = slice(round(1.5 * fps), round(2.5 * fps))
+    masks = [Mask(name, gap.start, gap.stop) for name in ("leftUpperArm", "leftLowerArm", "leftHand")]
+    result = fill(motion, Guess(motion, wrong=1.0, claim=0.02), *masks)
+    assert 100 * error(result.motion, motion, gap) < 0.5
+
+
+def test_bare_poses_are_no_evidence_against_the_network():
+    motion, lost = walk(61), Mask(ALL, 1, 60)
+    result = fill(motion, Guess(motion, 0.0, 5.0), lost)
+    simple = error(straight(motion, lost), motion, slice(1, 60))
+    assert error(result.motion, motion, slice(1, 60)) < 0.05 * simple
+
+
+@pytest.mark.parametrize(("leap", "taken"), [(0.5, True), (0.02, False)])
+@pytest.mark.parametrize("at", [40, 47])
+def test_an_answer_that_leaps_where_the_clip_does_not_is_not_taken(at, leap, taken):
+    motion = walk(90)
+    lost = torch.zeros(90, dtype=torch.bool)
+    lost[40:55] = True
+    root = motion.root_position.clone()
+    root[at:55, 1] += leap
+    missing = MissingMask.of_frames(lost, motion.num_joints)
+    simple = interpolate_missing(motion, missing)
+    result, notes = take_simpler(replace(motion, root_position=root), simple, missing)
+    wanted = simple.root_position if taken else root
+    assert torch.allclose(result.root_position[lost], wanted[lost])
+    assert torch.equal(result.root_position[~lost], motion.root_position[~lost])
+    assert bool(notes) == taken
+
+
+SEAM_FRAMES = 120
+GAPS = [(40, 70), (50, 51), (0, 20), (117, 119)]
+
+
+def gap_mask(start, stop, frames=SEAM_FRAMES):
+    put = torch.zeros(frames, dtype=torch.bool)
+    put[start:stop] = True
+    return put
+
+
+def way(fps=30.0, frames=SEAM_FRAMES):
+    """A smooth way (frames, 3), metres."""
+    return vectors(frames, 1, fps=fps)[:, 0] + torch.arange(frames).double()[:, None] / fps
+
+
+def turning_bends(quats):
+    turns = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(quats[:-1]), quats[1:]))
+    return torch.diff(turns, dim=0).norm(dim=-1)
+
+
+@pytest.mark.parametrize(("start", "stop"), GAPS)
+def test_known_frames_stay_to_the_bit(start, stop):
+    put = gap_mask(start, stop)
+    wild = way() + put[:, None] * torch.randn(SEAM_FRAMES, 3, generator=generator(), dtype=torch.float64)
+    assert torch.equal(blend_seams_in_positions(wild, put, fps=30.0)[~put], wild[~put])
+    quats, turned = swaying(SEAM_FRAMES, 2), swaying(SEAM_FRAMES, 2, seed=5)
+    quats[start:stop, 1] = turned[start:stop, 1]
+    masks = torch.stack([torch.zeros_like(put), put], dim=1)
+    closed = blend_seams_in_rotations(quats, masks, fps=30.0)
+    assert torch.equal(closed[~masks], quats[~masks])
+
+
+@pytest.mark.parametrize(("start", "stop"), GAPS)
+def test_the_truth_is_left_nearly_alone(start, stop):
+    put, truth = gap_mask(start, stop), way()
+    assert (blend_seams_in_positions(truth, put, fps=30.0) - truth).norm(dim=-1).max() < 0.005
+    quats = swaying(SEAM_FRAMES, 3)
+    closed = blend_seams_in_rotations(quats, put[:, None].expand(-1, 3), fps=30.0)
+    assert apart_deg(closed, quats).max() < 0.5
+
+
+@pytest.mark.parametrize("fps", [30.0, 120.0])
+@pytest.mark.parametrize(("start", "stop"), GAPS[:2])
+def test_a_leap_at_the_edges_is_closed(start, stop, fps):
+    frames = int(SEAM_FRAMES * fps / 30)
+    put = gap_mask(int(start * fps / 30), int(stop * fps / 30), frames)[:, None]
+    truth = swaying(frames, 1, fps=fps)
+    turn = quat_xyzw(torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)).expand(frames, 1, 4)
+    leapt = torch.where(put[..., None], rotations.multiply(truth, turn), truth)
+    closed = blend_seams_in_rotations(leapt, put, fps=fps)
+    assert turning_bends(leapt).max() > 0.3
+    assert turning_bends(closed).max() < 0.2 * turning_bends(leapt).max()
+    leapt = way(fps, frames) + 0.3 * put
+    bends, closed_bends = (
+        torch.diff(each, n=2, dim=0).norm(dim=-1).max()
+        for each in (leapt, blend_seams_in_positions(leapt, put[:, 0], fps=fps))
+    )
+    assert bends > 0.25
+    assert closed_bends < 0.2 * bends
+
+
+RETRACED_FRAMES = 80
+CASES = [("canonical", 30), ("bandai", 30), ("daz", 30), ("daz", 120)]
+
+
+def told_by(motion, stretch=1.0):
+    """The motion's own trajectory at the prior's rate and of unit size."""
+    canonical = retarget.to_canonical(motion)[0].resample(30)
+    scale = leg_length(canonical.skeleton) / leg_length(CANONICAL)
+    small = Motion(CANONICAL, canonical.fps, canonical.root_position / scale, canonical.local_quat_xyzw)
+    return ToldPath(small, stretch)
+
+
+def hips_of(motion):
+    return retarget.to_canonical(motion)[0].root_position
+
+
+def elsewhere(motion, start, stop):
+    """The motion with the hips strewn about in these frames."""
+    spread = 3 * torch.randn(stop - start, 3, generator=generator(), dtype=torch.float64)
+    if motion.moving_offsets:
+        moving = {joint: values.clone() for joint, values in motion.moving_offsets.items()}
+        moving[min(moving)][start:stop] += spread
+        return replace(motion, moving_offsets=moving)
+    root = motion.root_position.clone()
+    root[start:stop] += spread
+    return replace(motion, root_position=root)
+
+
+@pytest.mark.parametrize(("rig", "fps"), CASES)
+def test_a_true_prediction_gives_back_the_way_and_what_is_known_stays_to_the_bit(rig, fps):
+    motion = on_rig(rig, RETRACED_FRAMES * fps // 30, fps=fps)
+    start, stop = fps // 2, 2 * fps
+    masks = [Mask(ROOT, start, stop)]
+    done = retraced(elsewhere(motion, start, stop), told_by(motion), masks, settings=UNFINISHED)
+    assert float((hips_of(done.motion) - hips_of(motion)).norm(dim=-1).max()) < (0.005 if fps == 30 else 0.01)
+    lost = MissingMask.of_masks(motion, masks, retarget.to_canonical(motion)[1])
+    assert torch.equal(done.motion.local_quat_xyzw, motion.local_quat_xyzw)
+    assert torch.equal(done.motion.root_position[~lost.root], motion.root_position[~lost.root])
+    for joint, values in motion.moving_offsets.items():
+        assert torch.equal(done.motion.moving_offsets[joint][~lost.root], values[~lost.root])
+
+
+@pytest.mark.parametrize("edges", [(20, 60), (0, 50), (30, RETRACED_FRAMES), (0, RETRACED_FRAMES)])
+def test_where_the_hips_were_while_they_are_lost_does_not_matter(edges):
+    motion, masks = walk(RETRACED_FRAMES), [Mask(ROOT, *edges)]
+    found = [
+        retraced(each, tiny_path(), masks, settings=UNFINISHED).motion for each in (motion, elsewhere(motion, *edges))
+    ]
+    assert torch.equal(found[0].root_position, found[1].root_position)
+    assert bool(found[0].root_position.isfinite().all())
+
+
+def test_who_stands_is_not_moved_by_what_the_walk_after_it_misses():
+    """20 frames of standing, then 20 of walking, which end 10 cm beside the place that is known."""
+    steps = torch.zeros(42, 3)
+    steps[21:, 2] = 0.04
+    predicted = torch.cumsum(steps, dim=0)
+    known = predicted.clone()
+    known[41:, 0] = 0.1
+    lost = torch.zeros(42, dtype=torch.bool)
+    lost[1:41] = True
+    found = close_path(predicted, known, lost)
+    assert float((found[:21] - predicted[:21]).abs().max()) < 0.001
+    assert float(torch.diff(found[:, 0]).max()) < 0.006
+    assert float((found[40] - known[41]).norm()) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("masks", "message"),
+    [
+        ([Mask(ROOT, 10, 90)], "ends after the motion's 80 frames"),
+        (
+            [Mask(ROOT, 0, RETRACED_FRAMES), Mask("leftHand", 5, 9)],
+            "over all frames of a motion whose joints are lost as well",
+        ),
+        ([Mask("leftHand", 5, 9)], "there is nothing to predict"),
+        ([Mask("leftElbow7", 5, 9)], "no joint"),
+        ([], "nothing to predict"),
+    ],
+)
+def test_masks_that_do_not_fit_are_refused(masks, message):
+    with pytest.raises(RequestError, match=message):
+        retraced(walk(RETRACED_FRAMES), tiny_path(), masks, inbetweener=SlerpInbetweener(), settings=UNFINISHED)

@@ -180,9 +180,7 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
 
     def networks(self) -> dict[str, nn.Module]:
         """All that is learnt, by its name in checkpoints."""
-        critic = (
-            {} if self.critic_trainer is None else {"average": self.average, "critic": self.critic_trainer.network}
-        )
+        critic = {} if self.critic_trainer is None else {"average": self.average, "critic": self.critic_trainer.network}
         return {"model": self.network, **critic}
 
     def optimisers(self) -> dict[str, torch.optim.Optimizer]:
