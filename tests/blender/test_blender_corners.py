@@ -43,7 +43,7 @@ def test_bones_that_travel_keep_their_places(facts):
     assert facts["travelling"] == ["mixamorig:Hips", "mixamorig:LeftUpLeg"]
 
 
-def test_what_constraints_keep_from_its_place_is_told(facts):
+def test_an_effector_kept_off_its_target_by_constraints_is_reported(facts):
     assert facts["apart"]["arm that is stretched"] < CLOSE, "constraints still hold"
     assert "mixamorig:Left" in facts["stretched printed"][0]
     assert " cm off: constraints" in facts["stretched printed"][0]
@@ -84,7 +84,7 @@ def test_walks_start_from_a_clean_pose(facts, kind, file, height):
     assert np.abs(facts["walked"][kind] - wanted).max() < 1e-5
 
 
-def test_curves_that_are_not_level_are_told_and_the_scene_is_long_enough(facts):
+def test_curves_off_the_floor_are_reported_and_the_scene_is_long_enough(facts):
     printed, end = facts["not level"]
     assert printed.endswith("is not level: the character walks at its median height")
     assert end == 12

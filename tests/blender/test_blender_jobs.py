@@ -112,7 +112,7 @@ def test_outside_of_a_gap_nothing_moves(played):
     assert moved[9:18].max() > 0.001
 
 
-def test_keys_stay_and_what_is_between_is_made(played):
+def test_keys_stay_and_frames_between_are_generated(played):
     _, _, kept, facts, arrays = played
     assert (kept / "tween" / "words.txt").read_text().split("\n")[4:6] == ["--keyframes", "0,8,16,24"]
     for stage in {"tweened", "again"} & facts["stages"].keys():

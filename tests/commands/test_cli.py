@@ -26,13 +26,13 @@ def walk(prior, tmp_path_factory) -> Path:
     return path
 
 
-def test_version_is_told(capsys):
+def test_version_is_printed(capsys):
     assert run("--version") == 0
     assert capsys.readouterr().out == f"mapctl {mapctl.__version__}\n"
 
 
 @pytest.mark.slow
-def test_strict_says_when_not_all_holds(prior, tmp_path, capsys):
+def test_strict_fails_when_a_constraint_does(prior, tmp_path, capsys):
     """The made-up prior's data reach 2 m/s."""
     words = ("follow", "line:4", "-o", tmp_path / "a.bvh", "--seconds", 0.4, "--prior", prior)
     assert run(*words, "--speed", 6) == 0
@@ -269,7 +269,7 @@ def paced_prior(tmp_path_factory):
         ("none", False, False),
     ],
 )
-def test_paces_are_told_unless_one_is_named(tmp_path, paced_prior, monkeypatch, style, paced, like_start):
+def test_paces_are_inferred_unless_one_is_named(tmp_path, paced_prior, monkeypatch, style, paced, like_start):
     class Asked(Exception):
         """Generation has begun."""
 

@@ -98,7 +98,7 @@ def test_any_format_to_any_format(every_format, capsys, source, ending):
     assert Path(f"out{ending}").stat().st_size > 1000
 
 
-def test_a_capture_says_its_rate_on_the_command_line(every_format):
+def test_a_captures_rate_is_printed(every_format):
     assert run("convert", "01.asf+in.amc", "out.npz", "--fps-in", "60", "--fps", "30") == 0
     motion = mapctl.load("out.npz")
     assert (motion.fps, motion.num_frames) == (30, 3)

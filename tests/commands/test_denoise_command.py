@@ -61,7 +61,7 @@ def test_report_and_mask(denoise, recording, tmp_path):
 
 
 @pytest.mark.slow
-def test_causal_is_said(denoise, recording, tmp_path, capsys):
+def test_causal_is_reported(denoise, recording, tmp_path, capsys):
     assert denoise(recording, "-o", tmp_path / "out.bvh", "--causal", "--delay", 0.3) == 0
     assert "causal: a frame is decided at most 0.30 s after it came" in capsys.readouterr().out
     assert mapctl.load(tmp_path / "out.bvh").num_frames == 40
@@ -117,7 +117,7 @@ def test_failures_are_listed_and_stop_no_other_file(denoise, folder, tmp_path, c
 
 
 @pytest.mark.slow
-def test_an_interrupted_folder_says_what_is_done_and_goes_on(denoise, folder, tmp_path, monkeypatch, capsys):
+def test_an_interrupted_folder_lists_finished_files_and_resumes(denoise, folder, tmp_path, monkeypatch, capsys):
     save, out = formats.save, tmp_path / "out"
 
     def interrupted(motion, path):

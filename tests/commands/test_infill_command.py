@@ -81,7 +81,7 @@ def test_what_stands_in_the_gap_does_not_matter(infill, recording, tmp_path, rig
     assert len(found) == 1
 
 
-def test_several_gaps_in_frames_and_seconds_are_told(infill, recording, tmp_path, capsys):
+def test_several_gaps_in_frames_and_seconds_are_printed(infill, recording, tmp_path, capsys):
     out = tmp_path / "out.npz"
     assert infill(recording(), "-o", out, "--gap", "1s:1.2s", "--gap", "10:15", *words_of("infiller")) == 0
     printed = capsys.readouterr()
@@ -180,7 +180,7 @@ def test_an_archive_with_nan_is_filled(infilled, tmp_path):
         ([("", 0, 20), ("Hips Yposition", 20, 45)], "the gaps leave nothing of the motion's 45 frames to go by"),
     ],
 )
-def test_where_nothing_is_left_it_is_said(tiny, clip, tmp_path, capsys, lost, said):
+def test_an_empty_selection_is_reported(tiny, clip, tmp_path, capsys, lost, said):
     lossy = without(clip("bandai"), tmp_path / "lossy.bvh", lost)
     assert run("infill", lossy, "-o", tmp_path / "out.bvh", "--inbetweener", tiny) == 2
     printed = capsys.readouterr()
@@ -237,7 +237,7 @@ def test_only_the_hips_place_changes_and_only_there(walked, path, tmp_path, fini
     assert 1 <= changed.any(axis=0).sum() <= 3
 
 
-def test_ways_and_gaps_go_together_and_are_told(walked, path, tmp_path, capsys):
+def test_trajectories_and_gaps_go_together_and_are_printed(walked, path, tmp_path, capsys):
     infiller = save_tiny_infiller(tmp_path / "infiller.safetensors", drawn=0.2)
     report, out = tmp_path / "r.json", tmp_path / "out.bvh"
     words = ["--way", "10:40", "--gap", "20:25", "--path", path, "--method", "infiller", "--inbetweener", infiller]

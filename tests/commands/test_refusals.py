@@ -193,7 +193,7 @@ CASES = {
     "follow line:4 -o gone/a.bvh": "does not exist",
     "follow line:4 -o .": "cannot write .",
     "follow line:4 -o a.bvh --report gone/a.json": "gone",
-    "follow line:4 -o a.bvh --report a.bvh": "asked for twice",
+    "follow line:4 -o a.bvh --report a.bvh": "requested twice",
     "follow line:4 -o a.bvh --video a.avi": ".mp4",
     "follow line:4 -o /proc/self/a.bvh": "cannot write",
     "generate -o /proc/self/gen --seconds 1": "cannot write",

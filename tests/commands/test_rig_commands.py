@@ -46,7 +46,7 @@ def clip(tmp_path_factory):
     return path
 
 
-def test_info_tells_a_clips_rig(clip, capsys):
+def test_info_prints_a_clips_rig(clip, capsys):
     assert run("info", clip, "--json") == 0
     printed = json.loads(capsys.readouterr().out)
     assert (printed["rig"], printed["up"], printed["facing"], printed["rest_pose"]) == ("mixamo", "z", "-y", "A")
@@ -60,7 +60,7 @@ def test_info_tells_a_clips_rig(clip, capsys):
 
 
 @pytest.mark.slow
-def test_info_tells_a_sure_fit_and_draws_it(clip, tmp_path, capsys):
+def test_info_prints_a_sure_fit_and_draws_it(clip, tmp_path, capsys):
     assert run("info", clip, "-o", tmp_path / "rig.png") == 0
     assert "fit: sure\n" in capsys.readouterr().out
     with Image.open(tmp_path / "rig.png") as picture:
@@ -99,7 +99,7 @@ def test_info_prints_every_doubt_and_other_commands_the_first_once(odd, tmp_path
     assert capsys.readouterr().err == f"mapctl: {odd}: {reason}; {overrule}, see mapctl info {odd}\n"
 
 
-def test_info_tells_of_a_refused_clip_what_can_be_told(tmp_path, capsys):
+def test_info_prints_what_is_known_of_a_refused_clip(tmp_path, capsys):
     CASES["a dog with a person's names"].motion.save(tmp_path / "dog.bvh")
     assert run("info", tmp_path / "dog.bvh", "-o", tmp_path / "dog.png") == 2
     printed = capsys.readouterr()

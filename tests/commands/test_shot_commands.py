@@ -26,7 +26,7 @@ def keys(tmp_path):
 
 
 @pytest.mark.slow
-def test_follow_starts_and_ends_standing_and_tells_every_wish(keys, tmp_path, capsys):
+def test_follow_starts_and_ends_standing_and_reports_every_constraint(keys, tmp_path, capsys):
     out, report = tmp_path / "a.bvh", tmp_path / "a.json"
     words = [
         "--start",

@@ -54,7 +54,7 @@ def test_a_script_is_played_against_the_clock(steer, tmp_path):
 
 
 @pytest.mark.slow
-def test_turning_and_labels_are_said_and_what_the_prior_does_not_know_is_refused(steer, tmp_path, capsys):
+def test_turning_and_labels_are_printed_and_unknown_labels_refused(steer, tmp_path, capsys):
     script = "time_s,speed_mps,heading_deg,turn_deg_s,style\n0,1.2,0,30,{}\n0.4,1.2,0,,\n"
     assert steer(script.format(""), "--report", tmp_path / "r.json") == 0
     row = json.loads((tmp_path / "r.json").read_text())["commands"][0]
@@ -68,7 +68,7 @@ def test_turning_and_labels_are_said_and_what_the_prior_does_not_know_is_refused
 
 
 @pytest.mark.slow
-def test_speeds_that_nobody_runs_are_lowered_and_said(steer, capsys):
+def test_impossible_speeds_are_lowered_and_reported(steer, capsys):
     fast = "time_s,speed_mps,heading_deg\n0,50,0\n0.2,50,0\n"
     assert steer(fast) == 0
     assert "the speed of 50 m/s at 0 s was lowered to 2.20 m/s" in capsys.readouterr().out
@@ -91,7 +91,7 @@ def test_a_command_that_the_walk_obeys_is_reached_at_once_and_another_never():
 
 
 @pytest.mark.slow
-def test_what_hands_and_head_are_told_and_what_is_walked_round_is_reported(steer, tmp_path, capsys):
+def test_targets_of_hands_and_head_and_obstacles_are_reported(steer, tmp_path, capsys):
     script = (
         "time_s,speed_mps,heading_deg,right_hand_x,right_hand_y,right_hand_z,look_x,look_y,look_z\n"
         "0,0,0,-0.3,1.1,0.4,-1,1.3,2\n2,0,0,,,,,,\n2.2,0,0,,,,,,\n"
@@ -108,7 +108,7 @@ def test_what_hands_and_head_are_told_and_what_is_walked_round_is_reported(steer
 GOTO = "time_s,speed_mps,heading_deg,goto_x_m,goto_z_m,within_s,goto_facing_deg,pose\n0,1.2,0,,,,,\n"
 
 
-def test_a_place_is_reached_in_time_and_told(steer, tmp_path, capsys):
+def test_a_target_position_is_reached_in_time_and_reported(steer, tmp_path, capsys):
     stitcher = save_tiny_stitcher(tmp_path / "stitch.safetensors")
     replace(walk(10), licence="CC BY 4.0 (a studio)").save(tmp_path / "pose.npz")
     script = GOTO + "0.2,1.0,40,0.3,0.4,0.7,20,pose.npz:7\n"
@@ -125,7 +125,7 @@ def test_a_place_is_reached_in_time_and_told(steer, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_a_place_that_nobody_reaches_is_said_and_strict_fails(steer, tmp_path, capsys):
+def test_an_unreachable_position_is_reported_and_strict_fails(steer, tmp_path, capsys):
     stitcher = save_tiny_stitcher(tmp_path / "stitch.safetensors")
     script = GOTO + "0.2,1.0,40,30,0,0.7,,\n"
     assert steer(script, "--strict", "--stitcher", stitcher, "--report", tmp_path / "r.json") == 3

@@ -72,7 +72,7 @@ def test_a_tweener_meets_keys_in_a_style_of_another_rig_s_clip(source, tmp_path)
 
 
 @pytest.mark.slow
-def test_frames_keys_and_notes_are_told(tween, source, tmp_path, capsys):
+def test_frames_keys_and_notes_are_printed(tween, source, tmp_path, capsys):
     motion = on_rig("bandai", FRAMES)
     (hips,) = motion.moving_offsets
     motion.moving_offsets[hips][21:, 0] += 2.0
@@ -94,7 +94,7 @@ def test_frames_keys_and_notes_are_told(tween, source, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "what"), [([], "pose"), (["--joints", "Hand_L, Foot_R"], "limbs"), (["--root-only"], "root")]
 )
-def test_a_report_tells_every_key_and_how_far_it_is_missed(tween, source, tmp_path, words, what):
+def test_a_report_lists_every_key_with_its_residual(tween, source, tmp_path, words, what):
     report = tmp_path / "r.json"
     words = [*words, "--keyframes", "0,16,33,44", *words_of("infiller"), "--report", report, "--quiet"]
     assert tween(source, "-o", tmp_path / "out.bvh", *words) == 0
@@ -181,7 +181,7 @@ def test_keys_of_every_kind_are_met_in_the_file(tween_keys, poses, capsys):
     assert "key_timing" not in printed
 
 
-def test_timing_is_suggested_and_the_given_one_made(poses, capsys):
+def test_timing_is_suggested_and_a_given_one_obeyed(poses, capsys):
     keys = poses / "keys" / "keys.toml"
     words = [*words_of("slerp"), "--suggest-timing", "--report", "r.json"]
     assert run("tween", keys, "-o", "out.bvh", *words) == 0
@@ -295,7 +295,7 @@ def test_infill_and_chain_stitch(clip):
     assert formats.load("long.bvh").num_frames >= 32
 
 
-def test_a_gap_that_is_too_long_is_anothers_and_the_note_says_so(clip, capsys):
+def test_too_long_a_gap_falls_to_the_next_proposer_with_a_note(clip, capsys):
     words = ("tween", clip, "-o", "one.bvh", "--keyframes", "0,30", *STITCH)
     assert run(*(word for word in words if word != "--quiet")) == 0
     printed = capsys.readouterr().out
@@ -304,7 +304,7 @@ def test_a_gap_that_is_too_long_is_anothers_and_the_note_says_so(clip, capsys):
 
 
 @pytest.mark.slow
-def test_auto_stitches_where_a_hand_is_told(clip, capsys):
+def test_auto_stitches_where_a_hand_is_keyed(clip, capsys):
     words = ("tween", clip, "-o", "one.bvh", "--no-refine", "--stitcher", "own.safetensors", "--joints", "leftHand")
     assert run(*words, "--keyframes", "0,10,20") == 0
     assert "frames 1:20: stitcher, led by the constraints in it" in capsys.readouterr().out

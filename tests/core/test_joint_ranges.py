@@ -43,7 +43,7 @@ def calm():
     return walk_through(torch.zeros(30, 2), swing=0.3)
 
 
-def test_who_is_beyond_is_named_with_frame_and_degrees():
+def test_a_joint_beyond_its_limit_is_named_with_frame_and_degrees():
     motion = calm()
     quats = motion.local_quat_xyzw.clone()
     knee = LIMBS["leftFoot"].lower

@@ -43,7 +43,7 @@ def result(curve, *, laps=1.0, sway=0.03, speed=1.3, fps=FPS, seed=0):
 
 @pytest.mark.parametrize("name", CURVES)
 @pytest.mark.parametrize("fps", [30, 120])
-def test_arcs_are_those_that_the_walk_was_made_from(name, fps):
+def test_arcs_are_those_of_the_generated_walk(name, fps):
     curve = CURVES[name]
     arcs, _, positions = result(curve, laps=LAPS.get(name, 1.0), fps=fps)
     found = track_arcs(curve, positions)

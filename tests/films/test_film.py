@@ -67,7 +67,7 @@ def test_an_mp4_has_every_frame_at_the_motions_rate(renderer, tmp_path):
 
 
 @pytest.mark.parametrize("renderer", RENDERERS)
-def test_left_and_right_can_be_told_by_their_pixels(renderer):
+def test_left_and_right_differ_in_their_pixels(renderer):
     stage = Stage([Shot(walk(3, speed=0.0))])
     # From the front the actor's left hand is on the right of the picture.
     view = stage.views(CameraSettings(azimuth_deg=0.0, elevation_deg=5.0), (128, 128))[0]
@@ -168,7 +168,7 @@ def test_a_film_that_fails_leaves_nothing_behind_and_an_older_one_alone(tmp_path
     assert old.read_bytes() == b"precious"
 
 
-def test_without_opengl_there_are_stick_figures_and_one_line_says_so(monkeypatch, caplog):
+def test_without_opengl_there_are_stick_figures_and_a_note(monkeypatch, caplog):
     def missing():
         raise renderers.NoGraphicsError("no OpenGL without a window (libEGL.so.1 not found)")
 

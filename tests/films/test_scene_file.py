@@ -44,7 +44,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_what_is_wrong_is_said_in_one_line_with_file_and_key(case, tmp_path):
+def test_faults_are_reported_in_one_line_with_file_and_key(case, tmp_path):
     text, words = WRONG[case]
     path = tmp_path / "scene.toml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())

@@ -35,7 +35,7 @@ def test_a_mark_is_strong_at_its_time_and_faint_at_others():
 
 
 @pytest.mark.parametrize("renderer", ["egl", "stick"])
-def test_one_sees_through_a_pose_and_it_covers_the_actor_who_is_in_it(renderer):
+def test_a_ghost_pose_is_translucent_and_covers_its_actor(renderer):
     try:
         brush = select_painter(renderer)
     except renderers.NoGraphicsError:

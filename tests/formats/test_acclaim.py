@@ -26,7 +26,7 @@ def test_bones_that_a_take_never_names_rest(tmp_path):
     assert_same_places(mapctl.load(given.write(tmp_path)), given)
 
 
-def test_the_rate_is_120_unless_the_file_or_the_caller_says(tmp_path):
+def test_the_rate_is_120_unless_the_file_or_the_caller_gives_one(tmp_path):
     path = pair(2).write(tmp_path)
     assert mapctl.load(path).fps == 120
     assert mapctl.load(path, fps=60).fps == 60
@@ -42,7 +42,7 @@ def test_the_rate_is_120_unless_the_file_or_the_caller_says(tmp_path):
 
 
 @pytest.mark.parametrize(("length", "scale"), [(0.45, 1.0), (1.0, 1.0), (2.54, 0.45 / 2.54)])
-def test_lengths_are_told_by_the_file_or_else_by_the_body(tmp_path, length, scale):
+def test_lengths_come_from_the_file_or_else_from_the_body(tmp_path, length, scale):
     """`length 1` says nothing: the leg is of a person in the CMU unit, so that it is."""
     given = pair(1)
     usual = mapctl.load(given.write(tmp_path)).skeleton.offsets
@@ -88,7 +88,7 @@ class TestFinding:
             mapctl.load("01.asf+01_03.amc")
 
     @pytest.mark.parametrize("name", [f"{'x' * 300}.amc", f"{'x' * 300}.asf+x.amc", f"a.asf+{'x' * 300}.amc"])
-    def test_a_name_that_cannot_be_is_said_to_be_so(self, tmp_path, name):
+    def test_an_impossible_name_is_refused(self, tmp_path, name):
         (tmp_path / "a.asf").write_text(pair(1).asf())
         with pytest.raises(FileFormatError, match="name too long"):
             mapctl.load(tmp_path / name)

@@ -80,7 +80,7 @@ def test_a_joint_that_moves_within_its_parent_is_kept():
         (np.array([[1.0, 0.3, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), "not the same along all axes"),
     ],
 )
-def test_uneven_scale_is_told_with_its_joint(linear, why):
+def test_uneven_scale_is_reported_with_its_joint(linear, why):
     worlds = np.tile(np.eye(4), (3, 1, 1))
     worlds[1, :3, :3] = linear
     with pytest.raises(UnevenScaleError, match=f"joint b: .*{why}"):

@@ -18,7 +18,7 @@ def bones(motion) -> dict[str, list[float]]:
     return {name: [round(x, 6) for x in offset] for name, offset in zip(names[1:], offsets[1:].tolist(), strict=True)}
 
 
-def test_it_is_the_walk_that_its_page_tells_of():
+def test_it_is_the_walk_of_its_page():
     motion = mapctl.load(NAME)
     assert (motion.num_frames, float(motion.fps)) == (240, 30)
     assert bones(motion) == bones(make_example.performer())

@@ -66,7 +66,7 @@ def test_the_rate_of_television(tmp_path):
 
 
 @pytest.mark.slow
-def test_takes_and_armatures_are_told_by_name(tmp_path):
+def test_takes_and_armatures_are_chosen_by_name(tmp_path):
     path = tmp_path / "a.fbx"
     make_fbx(path, takes=("Walk", "Run"))
     assert [formats.load(f"{path}{choice}").source.animation for choice in ("", "#/Run", "#Armature/Walk")] == [

@@ -359,7 +359,7 @@ def test_a_vrma_is_read_back(kind, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["canonical", "vrm", "vrm0"])
-def test_a_vrma_is_as_its_specification_says(kind, tmp_path):
+def test_a_vrma_follows_its_specification(kind, tmp_path):
     out = tmp_path / "out.vrma"
     (walk(5) if kind == "canonical" else formats.load(make_animated(tmp_path, kind).path)).save(out)
     tree, _ = split_glb(out.read_bytes())
@@ -385,7 +385,7 @@ def test_a_vrma_is_as_its_specification_says(kind, tmp_path):
         assert at[f"{side}Toes"][2] > at[f"{side}Foot"][2]
 
 
-def test_a_motion_whose_bones_are_not_known_is_refused(tmp_path):
+def test_a_motion_with_unknown_bones_is_refused(tmp_path):
     with pytest.raises(RequestError, match=r"a \.vrma needs the motion of a VRM or of canonical joints"):
         formats.load(make_animated(tmp_path, "mixamo").path).save(tmp_path / "out.vrma")
 
@@ -431,7 +431,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("fault", BROKEN)
-def test_faults_are_told_in_a_line(fault, tmp_path):
+def test_faults_are_reported_in_a_line(fault, tmp_path):
     result = make(tmp_path, "mixamo")
     change, given = BROKEN[fault]
     edit_glb(result.path, lambda tree: change(tree, result))

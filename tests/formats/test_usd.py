@@ -276,7 +276,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("fault", BAD)
-def test_one_line_says_what(fault, tmp_path, capfd):
+def test_one_line_names_the_fault(fault, tmp_path, capfd):
     path = make(tmp_path, "plain", frames=2)
     pattern, instead, words = BAD[fault]
     path.write_text(re.sub(pattern, instead, path.read_text(), count=1, flags=re.DOTALL))

@@ -154,7 +154,7 @@ def test_lost_joints_are_filled_and_no_other(rig):
 
 
 @pytest.mark.parametrize("method", ["infiller", "auto"])
-def test_gaps_at_the_beginning_and_the_end_are_extended_into_and_said(method):
+def test_gaps_at_either_end_are_extended_into_and_reported(method):
     motion = on_rig("bandai", 50)
     masks = [Mask(ALL, 0, 8), Mask(ALL, 42, 50)]
     done = filled(motion, *masks, method=method)
@@ -162,7 +162,7 @@ def test_gaps_at_the_beginning_and_the_end_are_extended_into_and_said(method):
     assert [note.partition(":")[0] for note in done.notes][:2] == ["a gap at the beginning", "a gap at the end"]
 
 
-def test_who_stands_with_a_foot_on_a_step_is_not_lifted_off_the_floor():
+def test_standing_with_a_foot_on_a_step_is_not_lifted_off_the_floor():
     motion = walk(60)
     quats = motion.local_quat_xyzw[:1].expand(60, -1, -1).clone()
     bend = torch.tensor(1.2, dtype=torch.float64)
@@ -223,7 +223,7 @@ def test_a_standing_character_stays():
 @pytest.mark.parametrize(
     ("sway", "frames", "by"), [(0.01, 90, "network"), (0.06, 90, STANDING_STILL), (0.06, 40, "network")]
 )
-def test_who_stands_may_gesture_but_not_wander(sway, frames, by):
+def test_a_standing_character_may_gesture_but_not_drift(sway, frames, by):
     motion = still(frames + 2)
     query, answer = chosen(motion, 1, frames + 1, network=Network(sway=sway, wave=1.5))
     assert [source.by for source in answer.attribute(query)] == [by]
@@ -463,7 +463,7 @@ def test_where_the_hips_were_while_they_are_lost_does_not_matter(edges):
     assert bool(found[0].root_position.isfinite().all())
 
 
-def test_who_stands_is_not_moved_by_what_the_walk_after_it_misses():
+def test_standing_is_not_moved_by_residuals_of_the_walk_after_it():
     """20 frames of standing, then 20 of walking, which end 10 cm beside the place that is known."""
     steps = torch.zeros(42, 3)
     steps[21:, 2] = 0.04

@@ -29,7 +29,7 @@ def shifted_from(motion, frame, metres):
     return replace(motion, root_position=root)
 
 
-def test_where_in_the_world_and_what_lies_between_the_keys_tells_nothing():
+def test_position_in_the_world_and_frames_between_the_keys_change_nothing():
     motion = walk(90, turn_rate=0.3)
     found = frames(suggest_intervals(motion, KEYS))
     assert frames(suggest_intervals(moved(motion, turn=2.0, shift=(5.0, -3.0)), KEYS)) == found

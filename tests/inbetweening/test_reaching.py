@@ -82,7 +82,7 @@ def test_only_the_limb_turns_and_only_where_it_is_free(limb):
 
 
 @pytest.mark.parametrize("limb", LIMBS)
-def test_out_of_reach_the_limb_is_straight_and_points_there_and_is_said_to_miss(limb):
+def test_out_of_reach_the_limb_is_straight_and_its_miss_is_reported(limb):
     motion = walk(31)
     begins, ends = (place_of(motion, 15, joint) for joint in (CANONICAL.names[LIMBS[limb].upper], limb))
     length = float(lengths(motion)[15, [LIMBS[limb].lower - 1, LIMBS[limb].end - 1]].sum())
@@ -154,7 +154,7 @@ def test_a_hand_gets_there_and_standing_feet_stay(where):
     assert torch.equal(result.local_quat_xyzw[others], motion.local_quat_xyzw[others])
 
 
-def test_somebody_on_the_way_is_rather_a_little_further_than_stretched():
+def test_an_oncoming_walker_is_passed_further_off_rather_than_stretched():
     motion = walk(3, cadence=0.0)
     targets = asked(motion, 1, HAND, beside(motion, 1, ahead=0.9))
     result, shift = reach(motion, targets, stray=0.5)

@@ -155,7 +155,7 @@ def test_hands_and_feet_are_met_and_the_rest_is_free(rig, fps, method):
 
 
 @pytest.mark.slow
-def test_a_hand_whose_place_is_out_of_reach_is_said_to_miss_it():
+def test_an_unreachable_hand_target_is_reported_as_missed():
     motion = on_rig("canonical", 45)
     root = motion.root_position.clone()
     root[22] += torch.tensor([0.0, 1.5, 0.0]).double()
@@ -263,7 +263,7 @@ REACH_RATES = [("canonical", 30), ("bandai", 30), ("daz", 120), ("canonical", 24
         for case in ((*rig, position) for rig in REACH_RATES)
     ],
 )
-def test_a_hand_told_at_one_frame_goes_there_and_back(rig, fps, position):
+def test_a_hand_keyframe_is_reached_and_left(rig, fps, position):
     """No faster than 1.9 times the distance over the time of a smooth reach, and as calmly."""
     motion = on_rig(rig, 3 * fps, fps=fps)
     scale = float(to_canonical(motion)[0].root_position[0, 1]) / 0.95
@@ -280,7 +280,7 @@ def test_a_hand_told_at_one_frame_goes_there_and_back(rig, fps, position):
 
 
 @pytest.mark.parametrize(("fps", "turn"), [(30, 1.2), (120, 0.0)])
-def test_hips_told_at_one_frame_do_not_swing_the_body(fps, turn):
+def test_hips_keyed_at_one_frame_do_not_swing_the_body(fps, turn):
     motion = walk(3 * fps, fps=fps, turn_rate=turn)
     own = peaks_of(motion)
     done = asked(motion, (0, Key(4 * fps // 3, root_only=True), 3 * fps - 1), method="infiller")
@@ -458,7 +458,7 @@ def test_what_is_no_walk_is_left_to_others(query):
 
 
 @pytest.mark.slow
-def test_auto_walks_over_places_where_a_density_does_and_says_so(tmp_path):
+def test_auto_walks_over_root_keys_where_a_density_does_with_a_note(tmp_path):
     motion = on_rig("bandai", 60)
     keys = Keys((Key(0, root_only="place"), Key(59, root_only="place")))
     density = priors.load(str(save_tiny_prior(tmp_path / "prior.safetensors")))

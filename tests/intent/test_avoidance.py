@@ -40,7 +40,7 @@ def test_a_point_gets_past_and_goes_on_as_wanted(obstacles):
     assert np.abs(np.arctan2(last[:, 0], last[:, 1])).max() < 0.05
 
 
-def test_who_is_on_the_way_past_one_side_is_led_past_it():
+def test_a_walker_passing_on_one_side_is_led_past_it():
     ahead = (Obstacle((0.0, 2.0), 0.5),)
     for heading in (0.5, -0.5):
         led = lead_around(ahead, position=(0.0, 0.0), heading=heading, wanted=0.0, speed=1.2)

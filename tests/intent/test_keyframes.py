@@ -61,7 +61,7 @@ def test_all_keys_of_a_table_are_read(tmp_path):
         (f"{TWO}]", "not TOML: "),
     ],
 )
-def test_what_is_wrong_is_said_with_its_place(tmp_path, text, said):
+def test_faults_are_reported_with_their_position(tmp_path, text, said):
     path = written(tmp_path, text)
     with pytest.raises(FileFormatError) as caught:
         read_keys(path)
@@ -85,7 +85,7 @@ def test_joints_are_read_by_column_in_any_unit(tmp_path):
         ("", "the file is empty"),
     ],
 )
-def test_what_is_no_drawing_is_said_with_its_line(tmp_path, text, said):
+def test_an_invalid_drawing_is_refused_with_its_line(tmp_path, text, said):
     (tmp_path / "pose.csv").write_text(text)
     with pytest.raises(FileFormatError) as caught:
         read_drawing(tmp_path / "pose.csv")

@@ -15,7 +15,7 @@ SPEEDS = st.floats(0, 5)
 
 
 @given(ANGLES, ANGLES, SPEEDS, SPEEDS)
-def test_a_wish_comes_to_the_command_within_the_limits_and_by_the_short_way(heading, wanted, speed, asked):
+def test_a_command_approaches_its_target_within_the_limits_and_the_shorter_turn(heading, wanted, speed, asked):
     limits, command = SteeringLimits(acceleration=2, braking=3, turn_rate=2.5), Command(asked, wanted)
     wish = SteeringTarget(speed, heading, heading)
     requests = [wish, *wish.ahead(command, limits, frames=90, fps=30)]
@@ -31,13 +31,13 @@ def test_a_wish_comes_to_the_command_within_the_limits_and_by_the_short_way(head
 HAND = "left_hand_x,left_hand_y,left_hand_z"
 
 
-def test_speeds_beyond_the_priors_are_lowered_and_said():
+def test_speeds_beyond_the_priors_are_lowered_and_reported():
     track, said = CommandTrack((0.0, 1.0), (Command(50, 0), Command(1, 0))).limit_speed(3.0)
     assert [command.speed for command in track.commands] == [3.0, 1.0]
     assert said == ["the speed of 50 m/s at 0 s was lowered to 3.00 m/s, the prior's fastest"]
 
 
-def test_steps_that_nobody_takes_are_brought_near_and_said():
+def test_impossible_steps_are_brought_near_and_reported():
     held, said = Command(1.0, 0, step_length=99.0).within(3.0)
     assert held == Command(1.0, 0, step_length=STEP_LENGTHS[1])
     assert said == ["the step length of 99 m was lowered to 1.2 m; steps can be 0.3 to 1.2 m long"]

@@ -285,7 +285,7 @@ def test_a_long_capture_in_pieces_has_all_frames_and_no_jump(monkeypatch, rig, f
 
 
 @pytest.mark.parametrize("frames", [1, 7])
-def test_too_short_a_capture_is_unchanged_and_says_so(frames):
+def test_too_short_a_capture_is_unchanged_with_a_note(frames):
     given = noisy(on_rig("bandai", 30)).slice(0, frames)
     done = cleaned(given)
     assert torch.equal(done.motion.local_quat_xyzw, given.local_quat_xyzw)

@@ -122,7 +122,7 @@ def test_masks_count_from_the_first_frame_of_all():
 
 @pytest.mark.parametrize("fps", [24, 29.97, 120])
 @pytest.mark.parametrize("delay", [1 / 30, 0.2])
-def test_what_is_said_of_the_delay_holds_at_any_rate(fps, delay):
+def test_the_stated_delay_holds_at_any_rate(fps, delay):
     causal = CausalSettings(delay=delay)
     most, step = causal.compute_delay_frames(fps)
     assert stream(causal).delay == delay

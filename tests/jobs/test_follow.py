@@ -84,7 +84,7 @@ def test_an_interrupted_walk_keeps_what_was_solved():
     assert all(len(entry.energy) == 12 for entry in solution.ledger.entries)
 
 
-def test_a_deadline_returns_what_there_is_and_says_so():
+def test_a_deadline_returns_the_best_so_far_and_reports_it():
     solution = follow(curves.circle(radius=2), seconds=20, deadline_seconds=0.0)
     assert solution.status.outcome is Outcome.BUDGET
     assert solution.motion.num_frames == 1

@@ -225,7 +225,7 @@ def test_each_piece_is_sampled_given_its_pace():
     assert bool((sampled[:, TIMES] == 1).all())
 
 
-def test_what_is_not_taken_on_is_told_more_emphatically_and_then_no_more():
+def test_a_label_not_taken_on_is_guided_harder_and_then_dropped():
     slow = replace(PACED, needed=3, rates={("stand", "walk"): 5.0})
     sampled = sample(slow, 12)
     after = sampled[sampled[:, PACE] == 2]

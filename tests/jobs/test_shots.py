@@ -68,7 +68,7 @@ def test_speeds_rise_from_standing_and_end_at_the_curves_end(seconds):
 # Where
 
 
-def test_a_way_past_somebody_who_comes_the_other_way_keeps_apart_when_they_meet():
+def test_a_route_past_an_oncoming_walker_keeps_apart_when_they_meet():
     seconds = 5.0
     towards = torch.stack([torch.full((150,), 0.1), 6 - 1.2 * torch.arange(150) / 30], -1).double()
     request = ShotRequest(curves.line(length=6), seconds=seconds, others=Others(towards[None], 0.6))
@@ -141,7 +141,7 @@ def test_the_rest_pose_stands_on_both_feet_and_faces_forward():
     assert float(hands[0, 0]) == pytest.approx(-float(hands[1, 0]), abs=1e-6)
 
 
-def test_a_head_looks_where_it_is_told_and_back_without_a_jump():
+def test_a_head_looks_at_its_target_and_back_without_a_jump():
     motion = walk(120)
     look = Look(2.0, (3.0, 1.4, 4.0), 0.5)
     turned = turn_heads(motion, (look,))
@@ -171,7 +171,7 @@ def shot():
     return request, solve_shot(prior, priors.load_inbetweener(), request, generator=torch.Generator().manual_seed(1))
 
 
-def test_all_wishes_of_a_shot_hold(shot):
+def test_all_constraints_of_a_shot_hold(shot):
     _, done = shot
     assert done.status.ok, done.status.text
     assert {constraint.name.split(" at")[0] for constraint in done.constraints} >= {
@@ -206,7 +206,7 @@ def test_nothing_jumps_in_a_shot(shot):
 
 
 @pytest.mark.slow
-def test_who_reaches_far_aside_leaves_the_way_for_it_and_is_told():
+def test_a_reach_far_aside_leaves_the_trajectory_and_is_reported():
     prior = priors.load("locomotion")
     reach = Reach(2.0, {"leftHand": (1.3, 0.9, 2.4)})
     done = solve_shot(
@@ -223,7 +223,7 @@ def test_who_reaches_far_aside_leaves_the_way_for_it_and_is_told():
 
 
 @pytest.mark.slow
-def test_who_goes_on_from_a_gesture_comes_to_rest_without_a_jolt():
+def test_a_continuation_of_a_gesture_comes_to_rest_without_a_jolt():
     """Hands that were moving move on: the first steps are no harder than those within the clip and the shot."""
     prior, fps = priors.load("locomotion"), 30
     rest = build_rest_pose(prior, CANONICAL, TOE_REST_HEIGHT)
@@ -304,7 +304,7 @@ def jumping():
     return replace(motion, local_quat_xyzw=quats).slice(0, 80)
 
 
-def test_a_jump_is_made_anew_and_other_frames_stay(jumping):
+def test_a_jump_is_regenerated_and_other_frames_stay(jumping):
     assert find_jumps(jumping).nonzero()[:, 0].tolist() == [AT - 1]
     result = repair_jumps(jumping, LinearInbetweener())
     assert not bool(find_jumps(result).any())

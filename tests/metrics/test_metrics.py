@@ -206,7 +206,7 @@ def given(capsys, *words: object) -> dict:
 
 
 @pytest.mark.parametrize(("fps", "said"), [(Fraction(30000, 1001), False), (Fraction(24), True), (Fraction(15), True)])
-def test_slower_files_stay_as_they_are_and_that_is_said(fps, said):
+def test_slower_files_stay_as_they_are_with_a_note(fps, said):
     motion = replace(walk(60), fps=fps)
     comparable, notes = make_comparable(motion)
     assert comparable.num_frames == 60
@@ -221,7 +221,7 @@ def unknown() -> Motion:
     return random_motion(Skeleton(names, (-1, 0, 1, 0, 3), offsets), 40)
 
 
-def test_what_is_not_known_of_a_rig_is_said_in_one_line(tmp_path, capsys):
+def test_unknown_parts_of_a_rig_are_refused_in_one_line(tmp_path, capsys):
     unknown().save(tmp_path / "a.bvh")
     values = given(capsys, tmp_path / "a.bvh")
     assert values["notes"] == [f"{tmp_path / 'a.bvh'}: {UNKNOWN_RIG_NOTE}"]

@@ -76,7 +76,7 @@ def test_frechet_distance_of_a_shift_is_its_square_even_where_covariances_are_si
 
 
 @pytest.mark.slow
-def test_two_sets_of_one_kind_cannot_be_told_apart_and_trembling_can():
+def test_two_sets_of_one_kind_are_indistinguishable_and_trembling_is_not():
     mocap, alike = clip_set(24), clip_set(24, seed=1)
     shaky = [trembling(clip, 0.03, seed=k) for k, clip in enumerate(alike)]
     same, other = (

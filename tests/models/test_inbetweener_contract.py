@@ -54,7 +54,7 @@ def test_what_is_known_hardly_moves_and_the_query_not_at_all(kind):
 
 
 @pytest.mark.parametrize("kind", INBETWEENERS)
-def test_every_gap_is_somebody_s_and_the_same_generator_gives_the_same(kind):
+def test_every_gap_has_a_proposer_and_the_same_generator_gives_the_same(kind):
     query = query_of(MASKS["two gaps"])
     one, other = (INBETWEENERS[kind].propose(query, generator=torch.Generator().manual_seed(3)) for _ in range(2))
     sources = one.attribute(query)
@@ -92,7 +92,7 @@ def test_a_larger_body_moves_alike(kind):
     assert 0.8 < float(heights.min() / query.motion.root_position[:, 1].min()) < 1.25
 
 
-def test_a_gap_that_rollouts_do_not_take_is_left_to_their_fallback_and_said():
+def test_a_gap_refused_by_rollouts_falls_back_with_a_note():
     query = query_of([Mask(ALL, 10, 11), Mask(ALL, 20, 30)])
     short, rolled = INBETWEENERS["rollouts"].propose(query).attribute(query)
     assert (short.by, rolled.by) == ("slerp", "rollout of tiny")

@@ -275,7 +275,7 @@ def told_network() -> LstmGmm:
     return LstmGmm(LstmGmmConfig(width=8, components=2, labels=("gait=run", "style=old")), mean=mean, std=std)
 
 
-def test_a_copy_that_was_told_is_the_network_under_that_condition():
+def test_a_conditioned_copy_is_the_network_under_that_condition():
     network, inputs = told_network(), torch.randn(1, 6, 68, generator=generator())
     memory = network.start_after(inputs[:, 0])
     condition = torch.tensor([[0.0, 0.0, 1.0]])  # clean; not running; old
@@ -308,7 +308,7 @@ def labelled_density() -> LstmGmmDensity:
     return LstmGmmDensity("named", model, found, DataLimits(0.5, 1.5, 1.0), card, use_fast=False)
 
 
-def test_a_told_density_begins_where_the_labels_hold():
+def test_a_conditioned_density_begins_where_the_labels_hold():
     density = labelled_density()
     old_runner = density.conditioned_on(["run", "style=old"])
     assert old_runner.initial_states.names == ("a_run_old_1",)
@@ -321,7 +321,7 @@ def test_a_told_density_begins_where_the_labels_hold():
     assert not torch.allclose(given, unlabelled)
 
 
-def test_a_density_is_told_what_a_clips_path_tells_of_the_labels_that_it_knows():
+def test_a_density_is_conditioned_on_the_labels_of_a_clips_trajectory():
     density = labelled_density()
     state, noise = density.initial_states.state.pick(torch.tensor([0])), torch.zeros(1, 3, 66)
     plan = density.plan(state, noise)

@@ -64,7 +64,7 @@ def test_absent_frames_are_as_if_there_were_nothing():
     torch.testing.assert_close(one, other, atol=1e-6, rtol=0)
 
 
-def test_the_bundled_one_knows_who_stands_and_how_far_a_walk_goes():
+def test_the_bundled_one_knows_standing_and_how_far_a_walk_goes():
     predictor, motion = path.load(), walk(90)
     assert "Bandai" in predictor.card.licence or "NC" in predictor.card.licence
     stands = LocalMotion.of_world(motion.joint_positions().float()[None, :1].expand(1, 90, 21, 3), torch.zeros(1, 90))

@@ -77,7 +77,7 @@ def test_values_within_a_gap_do_not_matter():
     assert apart(DRAWN.propose(query).motion, DRAWN.propose(other).motion) < 1e-5
 
 
-def test_a_gap_longer_than_it_knows_is_left_and_said():
+def test_a_gap_longer_than_the_training_windows_is_left_and_reported():
     frames = module.MAX_GAP_FRAMES + 40
     query = query_of([Mask(ALL, 15, 20), Mask(ALL, 30, 31 + module.MAX_GAP_FRAMES)], frames=frames)
     answer = DRAWN.propose(query)

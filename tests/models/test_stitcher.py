@@ -183,7 +183,7 @@ def test_what_is_wanted_leads_the_answer(limb):
 
 
 @pytest.mark.slow
-def test_hips_that_are_told_alone_are_met_and_divide_the_gap():
+def test_hip_keys_alone_are_met_and_divide_the_gap():
     motion = walk(60, turn_rate=0.5)
     done = tween(motion, Keys.of([20, 28, 40], root_only=True), StitchedInbetweener(tiny_stitcher(), SlerpInbetweener))
     torch.testing.assert_close(done.motion.root_position[28], motion.root_position[28], atol=1e-6, rtol=0)

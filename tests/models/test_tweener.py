@@ -114,7 +114,7 @@ def furthest(one, other):
     return (one.local_quat_xyzw - other.local_quat_xyzw).abs().amax(dim=(1, 2))
 
 
-def test_a_style_changes_what_is_made_and_keeps_the_keys():
+def test_a_style_changes_the_generated_frames_and_keeps_the_keys():
     query, plain = query_of(walk(120), (1, 119)), tiny_tweener()
     styled = plain.styled(FAST)
     assert (plain.has_style, styled.has_style) == (False, True)
@@ -136,7 +136,7 @@ def test_a_class_of_the_card_is_a_style_without_poses():
 
 
 @pytest.mark.slow
-def test_a_long_gap_is_split_by_poses_of_the_style_or_of_the_keys_and_a_note_says_so():
+def test_a_long_gap_is_split_by_poses_of_the_style_or_of_the_keys_with_a_note():
     query, plain = query_of(walk(600), (10, 580)), tiny_tweener()
     result = {}
     for tweener, by in ((plain, "the keys beside it"), (plain.styled(FAST), "the style")):
@@ -238,7 +238,7 @@ def test_a_broken_class_is_refused(vector):
         read_classes(card, 5)
 
 
-def test_an_unknown_class_is_told_with_the_nearest():
+def test_an_unknown_class_is_refused_with_the_nearest():
     known = {name: Style(name, torch.zeros(5)) for name in ("wave-left-hand", "walk", "run")}
     assert pick_class(known, "run").name == "run"
     with pytest.raises(RequestError, match="no class wavelefthand; the nearest class is wave-left-hand"):

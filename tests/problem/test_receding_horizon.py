@@ -63,7 +63,7 @@ def test_windows_join_without_a_seam():
     torch.testing.assert_close(done.joints_world[-1, 0, ::2], ground[-1], atol=1e-5, rtol=1e-5)
 
 
-def test_every_window_keeps_its_budget_and_progress_is_told():
+def test_every_window_keeps_its_budget_and_progress_is_reported():
     given = []
     done, _ = solve(20, progress=lambda now, total: given.append((now, total)))
     assert all(record.evaluations <= 12 for record in done.windows)

@@ -26,13 +26,13 @@ def smooth_place(frames):
 
 @pytest.mark.parametrize("fps", [30, 120])
 @pytest.mark.parametrize("degrees", [0.5, 3, 15, 40])
-def test_white_noise_of_angles_is_told(degrees, fps):
+def test_white_noise_of_angles_is_recognised(degrees, fps):
     quats = shaken(swaying(800, fps=fps), degrees * DEGREE)
     assert told_deg(quats).tolist() == pytest.approx([degrees] * 6, rel=0.12)
 
 
 @pytest.mark.parametrize("centimetres", [0.1, 1, 5])
-def test_white_noise_of_places_is_told(centimetres):
+def test_white_noise_of_positions_is_recognised(centimetres):
     positions = smooth_place(800)
     noisy = positions + centimetres / 100 * torch.randn(800, 3, generator=generator(), dtype=torch.float64)
     seen = torch.ones(800, dtype=torch.bool)

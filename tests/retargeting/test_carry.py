@@ -66,7 +66,7 @@ def foot_pitch_deg(motion: Motion) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(("source", "body", "fps"), [(*pair, 30) for pair in PAIRS] + [(*PAIRS[2], 120)])
-def test_who_carries_a_walk_stands_as_in_its_own(source, body, fps):
+def test_a_retargeted_walker_stands_as_in_the_source(source, body, fps):
     clip, own = performer(source).walks(90 * fps // 30, fps), performer(body).walks()
     done = retarget_motion(clip, RiggedCharacter.of(own)[1])
     assert done.notes == ()

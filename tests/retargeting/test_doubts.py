@@ -88,7 +88,7 @@ def test_a_clip_without_bent_knees_leaves_the_twist_of_limbs_open():
     assert judge(result.motion(bent))[0] == SURE
 
 
-def test_somebody_who_lies_or_crawls_is_a_person_all_the_same_and_it_is_said():
+def test_a_lying_or_crawling_body_is_read_as_a_person_with_a_note():
     lying = person(1.0, 10)
     turn = torch.tensor([-(0.5**0.5), 0.0, 0.0, 0.5**0.5]).double()
     laid = lying.local_quat_xyzw.clone()

@@ -215,7 +215,7 @@ def test_a_character_that_has_ended_is_named_keeps_its_recording_and_comes_back(
     assert "frames late" in show.chosen.describe_status()
 
 
-def test_a_machine_that_is_too_slow_is_said_so(show, actors, monkeypatch):
+def test_too_slow_a_machine_is_reported(show, actors, monkeypatch):
     monkeypatch.setattr(actors[0], "poll", lambda: [delivered(0, spare=-0.2)])
     run(show, 12)
     assert "too slow" in show.chosen.describe_status()

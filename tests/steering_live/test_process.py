@@ -61,7 +61,7 @@ def test_a_hand_goes_to_what_is_aimed_at(remote):
 
 
 @pytest.mark.slow
-def test_it_goes_where_it_is_sent_and_says_what_is_too_far(remote):
+def test_a_target_is_reached_and_one_too_far_is_reported(remote):
     remote.command(Command(0.5, 0.0))
     remote.reset()
     x, _, z = collected(remote, 1.0)[-1].root[-1]

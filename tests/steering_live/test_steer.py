@@ -52,7 +52,7 @@ def test_a_step_delivers_its_frames_with_a_forecast_and_a_ledger():
 
 
 @pytest.mark.parametrize("least", [0, 2])
-def test_without_time_it_still_delivers_and_says_so(least):
+def test_without_time_it_still_delivers_with_a_note(least):
     state, _ = begun(settings=replace(QUICK, least_evaluations=least))
     _, piece = steer.step(state, AHEAD, seconds=0.0)
     assert piece.motion.num_frames == 3
@@ -61,7 +61,7 @@ def test_without_time_it_still_delivers_and_says_so(least):
     assert bool(torch.isfinite(piece.motion.local_quat_xyzw).all())
 
 
-def test_who_is_stuck_is_searched_without_footing_first():
+def test_a_stuck_search_is_repeated_without_footing_first():
     """Both searches count, and together with the draws they are no more than were allowed."""
     state, _ = steered(8)
     stuck = replace(state, settings=replace(QUICK, stuck=-1.0, random_starts=5))
@@ -78,7 +78,7 @@ def test_motion_that_is_not_finite_is_replaced_by_the_priors_own():
     assert bool(torch.isfinite(piece.motion.root_position).all())
 
 
-def test_a_command_tells_the_prior_for_as_long_as_it_holds(tmp_path):
+def test_a_command_conditions_the_prior_while_it_holds(tmp_path):
     prior = priors.load(str(save_tiny_prior(tmp_path / "p.safetensors", labels=("gait=run", "style=active"))))
     state, _ = steer.begin(prior, AHEAD, generator=generator(), settings=QUICK)
     printed = replace(AHEAD, labels=("run", "active"))

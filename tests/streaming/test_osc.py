@@ -126,7 +126,7 @@ def test_messages_arrive_in_order_and_nothing_waits(receiver):
     assert receiver.poll() == []
 
 
-def test_a_port_that_is_taken_is_said(receiver):
+def test_a_taken_port_is_reported(receiver):
     with pytest.raises(RequestError, match=rf"--listen: port {receiver.endpoint.port} of 127\.0\.0\.1 is in use"):
         OscReceiver(receiver.endpoint)
 

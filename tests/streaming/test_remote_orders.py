@@ -156,7 +156,7 @@ def test_every_frame_goes_to_the_stream_too(stage):
         ("speed", "fast"),
     ],
 )
-def test_what_cannot_be_is_said_and_changes_nothing(stage, capsys, message):
+def test_an_impossible_request_is_reported_and_changes_nothing(stage, capsys, message):
     show, actors, _, send = stage
     before = show.chosen.inputs
     send(message)

@@ -148,7 +148,7 @@ def start_command(*words: object) -> subprocess.Popen:
 
 
 @pytest.mark.slow
-def test_a_character_walks_where_osc_says(tmp_path):
+def test_a_character_follows_its_osc_commands(tmp_path):
     """`mapctl live` as it is, for 15 seconds, with the bundled prior; Ctrl-C ends it."""
     port, listen = free_ports(1), free_ports(3) + 2
     with engine(port) as listener, SimpleUDPClient("127.0.0.1", listen) as client:

@@ -261,7 +261,7 @@ def test_takes_of_cmu_have_a_table_that_comes_with_mapctl(files, tmp_path, monke
     assert read(files, tmp_path, cuts=Path("cmu")).lengths[0] == 40
 
 
-def test_a_cut_that_a_file_is_too_short_for_leaves_the_file_out_and_says_so(files, tmp_path):
+def test_a_file_too_short_for_its_cut_is_left_out_and_reported(files, tmp_path):
     found = read(files, tmp_path, cuts=table(tmp_path, "walk-0,5,80", "walk-1,79,", "walk-2,0,79"))
     assert found.names == ("walk-2.bvh",)
     assert set(found.skipped) == {"walk-0.bvh", "walk-1.bvh"}

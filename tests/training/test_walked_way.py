@@ -25,7 +25,7 @@ def lead(displacement, first, last, frames=FRAMES, turn=0.0):
     return share[..., None] * end, headings, given
 
 
-def test_who_walks_round_a_corner_leaves_along_one_heading_and_comes_along_the_other():
+def test_a_corner_is_left_along_one_heading_and_entered_along_the_other():
     way, facing = bend_trajectory(*lead((4.0, 4.0), 0.0, 90.0))
     degrees = torch.rad2deg(facing[0])
     assert degrees[:32].abs().max() < 15
@@ -48,14 +48,14 @@ def test_who_walks_round_a_corner_leaves_along_one_heading_and_comes_along_the_o
         ((0.7, 0.7), 0.0, 90.0, 30),  # a second
     ],
 )
-def test_the_way_stays_straight_for_who_does_not_walk_ahead_or_has_no_time(displacement, first, last, frames):
+def test_the_route_stays_straight_for_sidesteps_or_without_time(displacement, first, last, frames):
     way, facing, given = lead(displacement, first, last, frames)
     bent, turned = bend_trajectory(way, facing, given)
     assert torch.equal(bent, way)
     assert torch.equal(turned, facing)
 
 
-def test_what_is_told_stays_and_a_way_turned_elsewhere_is_the_same_one():
+def test_given_frames_stay_and_a_turned_trajectory_gives_the_same_motion():
     way, facing, given = lead((3.0, 5.0), -10.0, 60.0)
     bent, turned = bend_trajectory(way, facing, given)
     assert torch.equal(bent[given], way[given])
