@@ -797,7 +797,7 @@ _TRAJECTORY_STRIDE = 6  # frames from one residual of a trajectory to the next
 
 @dataclass(frozen=True, eq=False)
 class Constraints:
-    """Wishes about the frames of one gap, on the canonical skeleton, seen from the pose before it."""
+    """Constraints on the frames of one gap, on the canonical skeleton, seen from the pose before it."""
 
     positions: Float[Tensor, "frames joints 3"]
     """Positions that joints are to have, metres."""
@@ -836,7 +836,7 @@ class Constraints:
         return Constraints(points, wanted, turned[faced], faced, root[:, ::2] if query.keep_trajectory else None)
 
     def measure(self, joined: Joined) -> Float[Tensor, "batch residuals"]:
-        """Measure by how much motions miss each wish along each axis, in standard deviations."""
+        """Measure by how much motions miss each constraint along each axis, in standard deviations."""
         points, facing, trajectory = self._measure(joined)
         hands = torch.isin(self.wanted.nonzero()[:, 1], torch.tensor(_HANDS))
         sigma = torch.where(hands, _SIGMA_HAND, _SIGMA)[:, None]
@@ -844,7 +844,7 @@ class Constraints:
         return torch.cat([part.flatten(1) for part in parts], dim=1)
 
     def measure_farthest(self, joined: Joined) -> float:
-        """Measure the largest distance of one motion to a wish, metres."""
+        """Measure the largest distance of one motion to a constraint, metres."""
         return max((float(part[0].norm(dim=-1).max()) for part in self._measure(joined) if part.numel()), default=0.0)
 
     def lay_along(self, joined: Joined) -> Joined:
@@ -1051,7 +1051,7 @@ class Stitcher(checkpoints.NetworkModel[StitcherNetwork], Inbetweener):
         return calm if bool(calm.finite.all()) else None
 
     def _fit(self, ends: Ends, start: int, stop: int, constraints: Constraints) -> Joined | None:
-        """Find the answer that meets the wishes about a gap, near the calm one or near the draw of this number; None
+        """Find the answer that meets the constraints on a gap, near the calm one or near the draw of this number; None
         where it is not finite."""
         frames, draws = stop - start + 1, self.draws
         if draws is None:

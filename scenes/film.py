@@ -209,7 +209,7 @@ def film(
 ) -> list[Path]:
     """Film the actors walking together; one pass serves all outputs. Returns the paths written.
 
-    `actors` are Shots, or tuples (motion, curve, colour, start seconds, wishes, drawn) of which all but the motion may
+    `actors` are Shots, or tuples (motion, curve, colour, start seconds, targets, drawn) of which all but the motion may
     be left out. Where stick figures are drawn a character is one of them, and a line is logged on that. `out` is a
     path or several, each ending in .mp4, .gif, .webp or .png (a contact sheet: ghosts along the trajectory over a row
     of stills). Each frame of the motions is one frame of the film unless `fps` resamples them. `size` is the width and

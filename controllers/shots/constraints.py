@@ -1,5 +1,5 @@
-"""Wishes of a shot measured on its motion: asked, got and residual of each, and conflicts among those that do not
-hold."""
+"""Constraints of a shot measured on its motion: asked, got and residual of each, and conflicts among those that do
+not hold."""
 
 import math
 from collections.abc import Sequence
@@ -24,15 +24,15 @@ _SEAM_RATIO = 1.2  # of a loop's largest step from one frame to the next
 _NEAR_KEY_SECONDS = 1.0
 _ASIDE = 0.05  # metres beside the curve, from which on a trajectory is bent toward a reach
 _STILL_AT_START, _STILL_AT_END = 12, 24  # frames at PRIOR_FPS in which one is to stand, beginning and ending
-_CONFLICT_FRAMES = 20  # before and after a wish, in which others are against it
+_CONFLICT_FRAMES = 20  # before and after a constraint, in which others conflict with it
 
 
 @dataclass(frozen=True)
 class Constraint:
-    """One wish of a shot."""
+    """One constraint of a shot."""
 
     name: str
-    """Name of the wish, with its time."""
+    """Name of the constraint, with its time."""
     asked: str
     """Requested value, in words and numbers."""
     got: float
@@ -50,7 +50,7 @@ class Constraint:
 
     @property
     def holds(self) -> bool:
-        """Whether the wish holds."""
+        """Whether the constraint holds."""
         return self.got >= self.limit if self.at_least else self.got <= self.limit
 
     @property
@@ -59,7 +59,7 @@ class Constraint:
         return max(0.0, self.limit - self.got if self.at_least else self.got - self.limit)
 
     def as_row(self) -> dict[str, Any]:
-        """Return the wish as a report shows it."""
+        """Return the row of a report."""
         names = ("asked", "got", "unit", "residual", "holds", "remedy", "seconds")
         return {"constraint": self.name, **{name: getattr(self, name) for name in names}}
 
@@ -67,7 +67,7 @@ class Constraint:
 def check_constraints(
     request: ShotRequest, trajectory: Trajectory, motion: Motion, met: Sequence[MetPose] = ()
 ) -> tuple[Constraint, ...]:
-    """Measure every wish of a request on its motion, at PRIOR_FPS; poses as they were met."""
+    """Measure every constraint of a request on its motion, at PRIOR_FPS; poses as they were met."""
     positions = motion.joint_positions()
     hips = positions[:, 0, ::2]
     away = _find_frames_away(request, trajectory)
@@ -111,8 +111,8 @@ def check_constraints(
 
 
 def describe_conflicts(constraints: Sequence[Constraint], trajectory: Trajectory, motion: Motion) -> list[str]:
-    """Describe every wish that does not hold: by how much, which others do not hold at that time, and what would settle
-    it."""
+    """Describe every constraint that does not hold: by how much, which others do not hold at that time, and what would
+    settle it."""
     sentences, offsets = [], _measure_offsets(trajectory, motion.root_position)
     for one in (constraint for constraint in constraints if not constraint.holds):
         rivals = [other for other in constraints if other is not one and not other.holds and _overlap(one, other)]
@@ -129,7 +129,7 @@ def describe_conflicts(constraints: Sequence[Constraint], trajectory: Trajectory
 
 
 def _overlap(one: Constraint, other: Constraint) -> bool:
-    """Return whether two wishes are at one time."""
+    """Return whether two constraints are at one time."""
     if one.seconds is None or other.seconds is None:
         return True
     apart = _CONFLICT_FRAMES / PRIOR_FPS

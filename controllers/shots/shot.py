@@ -46,19 +46,19 @@ from mapctl.terms import Term
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class ShotSolution(Solution):
-    """A shot's motion and what became of every wish."""
+    """A shot's motion and the residual of every constraint."""
 
     trajectory: Trajectory
     """The root trajectory that was planned."""
     constraints: tuple[Constraint, ...] = ()
-    """Each wish: asked, got, and the residual."""
+    """Each constraint: asked, got, and the residual."""
     reaches: tuple[Reach, ...] = ()
     """Reaches at the times at which they were met, those of keys' hands and feet included."""
     met: tuple[MetPose, ...] = ()
     """Keys of poses, positions and facings, as they were met."""
 
     def details(self) -> dict:
-        """Return the wishes."""
+        """Return the constraints."""
         return {"constraints": [constraint.as_row() for constraint in self.constraints]}
 
 
@@ -79,7 +79,7 @@ def solve_shot(
     Where nothing but a walk is requested, no `inbetweener` is needed, and after `deadline_seconds` of wall clock, and
     at Ctrl-C, the solution so far is returned, with that status. `terms` are the caller's own, in every window of
     the walks; they see the character at its own size and the time since the first frame. On another `skeleton`
-    strides are as long as its legs, and the toes' rest height is that of the settings' footing. Wishes that do not hold
+    strides are as long as its legs, and the toes' rest height is that of the settings' footing. Constraints that do not hold
     are named with numbers in the status, which is then infeasible.
     """
     if inbetweener is None and not request.walks_only:

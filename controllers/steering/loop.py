@@ -30,7 +30,7 @@ from mapctl.rotations import make_sign_continuous
 
 _MARGIN, _MOST_MARGIN = 0.015, 0.05  # seconds before frames are due at which a step is to end, for the display
 _MARGIN_USED, _MARGIN_RISE, _MARGIN_FALL = 0.75, 1.5, 0.997  # found within a second, and forgotten within a minute
-_SLACK = 0.1  # seconds by which frames may be late before time is held for them; less is made up by searching less
+_SLACK = 0.1  # seconds by which frames may be late before time is held for them; less is caught up by searching less
 
 Stepper: TypeAlias = Callable[..., tuple[SteerState, SteerFrames]]
 """(state, command, seconds=...) to the next state and frames, as `controllers.steering.steer.step`."""

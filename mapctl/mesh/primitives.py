@@ -1,4 +1,4 @@
-"""Coloured triangles, and the one solid everything round is made of.
+"""Coloured triangles, and the one solid everything round is built of.
 
 A rounded box is a sphere whose eight octants are moved apart: without extent it is a ball, with extent
 along one axis a capsule, along three a box with soft edges. Every body part is one, so a character is one

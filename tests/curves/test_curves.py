@@ -1,4 +1,4 @@
-"""Curves: geometry against closed forms, search against brute force, wishes that cannot be."""
+"""Curves: geometry against closed forms, search against brute force, impossible requests."""
 
 import math
 

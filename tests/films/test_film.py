@@ -87,8 +87,8 @@ def test_the_curve_and_the_growing_trail_are_seen(renderer):
         [len(near(brush.paint(views[k], stage.content(k)), c, 0.985)) for c in (colours.TARGET, colours.TRAIL)]
         for k in (1, 12, 23)
     ]
-    wish, trail = np.array(seen).T
-    assert wish[0] > 40
+    target, trail = np.array(seen).T
+    assert target[0] > 40
     assert trail[2] > trail[1] > trail[0]
 
 

@@ -17,8 +17,8 @@ SPEEDS = st.floats(0, 5)
 @given(ANGLES, ANGLES, SPEEDS, SPEEDS)
 def test_a_command_approaches_its_target_within_the_limits_and_the_shorter_turn(heading, wanted, speed, asked):
     limits, command = SteeringLimits(acceleration=2, braking=3, turn_rate=2.5), Command(asked, wanted)
-    wish = SteeringTarget(speed, heading, heading)
-    requests = [wish, *wish.ahead(command, limits, frames=90, fps=30)]
+    target = SteeringTarget(speed, heading, heading)
+    requests = [target, *target.ahead(command, limits, frames=90, fps=30)]
     for before, after in pairwise(requests):
         assert -3 / 30 - 1e-9 <= after.speed - before.speed <= 2 / 30 + 1e-9
         assert abs(after.heading - before.heading) <= 2.5 / 30 + 1e-9

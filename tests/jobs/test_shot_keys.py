@@ -1,4 +1,4 @@
-"""Keys of shots that tell poses, places and facings; ends in a clip's frame; loops; and what wishes cost."""
+"""Keys of poses, positions and facings in shots; ends in a clip's frame; loops; and the cost of constraints."""
 
 import math
 from dataclasses import replace

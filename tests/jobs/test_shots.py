@@ -80,7 +80,7 @@ def test_a_route_past_an_oncoming_walker_keeps_apart_when_they_meet():
     assert float((alone.curve.point(alone.arcs) - towards[: len(alone.arcs)]).norm(dim=-1).min()) < 0.2
 
 
-# Bad wishes
+# Invalid requests
 
 
 @pytest.mark.parametrize(

@@ -126,7 +126,7 @@ def test_what_was_stitched_is_reported():
 GAP = slice(21, 40)
 
 
-def wishing(motion, frame, limb, offset):
+def query_with_target(motion, frame, limb, offset):
     """A query that wants a limb elsewhere in a frame."""
     joint = motion.skeleton.index(limb)
     positions = motion.joint_positions().clone()
@@ -145,11 +145,11 @@ def miss(query, motion):
 def test_the_fit_is_that_of_least_squares(spread):
     """On a map that bends a little, beside scipy's: both minimise residuals and the distance from the centre."""
     draw = np.random.default_rng(1)
-    matrix, wish, centre = draw.normal(size=(5, 4)), draw.normal(size=5), draw.normal(size=4)
+    matrix, target, centre = draw.normal(size=(5, 4)), draw.normal(size=5), draw.normal(size=4)
 
     def residuals(codes):
         bent = codes @ matrix.T
-        return bent + 0.05 * np.sin(bent) - 3 * wish
+        return bent + 0.05 * np.sin(bent) - 3 * target
 
     def make(codes):  # motions whose hips go where the codes say
         root = torch.nn.functional.pad(codes[..., None], (0, 2)).float()
@@ -173,7 +173,7 @@ def test_the_fit_is_that_of_least_squares(spread):
 @pytest.mark.slow
 @pytest.mark.parametrize("limb", ["leftHand", "rightFoot"])
 def test_what_is_wanted_leads_the_answer(limb):
-    query = wishing(walk(60), 30, limb, (0.2, 0.25, 0.1))
+    query = query_with_target(walk(60), 30, limb, (0.2, 0.25, 0.1))
     plain = tiny_stitcher().propose(replace(query, effector_targets=None))
     led = tiny_stitcher().propose(query)
     assert miss(query, led.motion) < miss(query, plain.motion) - 0.001

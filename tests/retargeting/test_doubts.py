@@ -51,8 +51,8 @@ LOST = [(tree, name) for tree, name in LOST if name in TREES[tree].names]
 
 @pytest.mark.parametrize(("tree", "name"), LOST, ids=str)
 def test_a_rig_of_which_a_joint_lost_its_name_is_never_understood_wrongly_and_surely(tree, name):
-    wish = replace(TREES[tree], names={**TREES[tree].names, name: "a17"}, extras=False, arms_down_deg=30)
-    result = make(wish)
+    rig_request = replace(TREES[tree], names={**TREES[tree].names, name: "a17"}, extras=False, arms_down_deg=30)
+    result = make(rig_request)
     verdict, _, rigmap = judge(result.motion(person(1.0, 30)))
     if verdict == SURE:
         assert rigmap.joint_names == {c: own for c, own in result.joint.items() if c in rigmap.joint_names}
@@ -61,16 +61,16 @@ def test_a_rig_of_which_a_joint_lost_its_name_is_never_understood_wrongly_and_su
 @pytest.mark.parametrize("name", ["leftLowerArm", "leftFoot", "leftShoulder"])
 @pytest.mark.parametrize("tree", [("daz-genesis", "3 and 8"), ("xsens", "BVH"), ("unity", "avatar")], ids=str)
 def test_a_joint_without_a_name_is_found_by_the_other_side(tree, name):
-    wish = replace(TREES[tree], names={**TREES[tree].names, name: "a17"}, extras=False, arms_down_deg=30)
-    verdict, why, rigmap = judge(make(wish).motion(person(1.0, 30)))
+    rig_request = replace(TREES[tree], names={**TREES[tree].names, name: "a17"}, extras=False, arms_down_deg=30)
+    verdict, why, rigmap = judge(make(rig_request).motion(person(1.0, 30)))
     assert (verdict, rigmap.joint_names[name]) == (DOUBTFUL, "a17")
     assert f"{name} is known by its position alone (joint 'a17')" in why
 
 
 @pytest.mark.parametrize("preset", [rig.name for rig in rigs.known_rigs() if rig.name != "metahuman"])
 def test_no_listed_rig_is_doubtful(preset):
-    for wish in (Make(names_of(preset)), Make(names_of(preset), arms_down_deg=50, zup=True, root="Ground")):
-        assert judge(make(wish).motion(person(1.0, 30)))[:2] == (SURE, "")
+    for rig_request in (Make(names_of(preset)), Make(names_of(preset), arms_down_deg=50, zup=True, root="Ground")):
+        assert judge(make(rig_request).motion(person(1.0, 30)))[:2] == (SURE, "")
 
 
 def test_a_clip_without_bent_knees_leaves_the_twist_of_limbs_open():

@@ -51,9 +51,9 @@ def assert_understood(result, wanted, canonical, rigmap, *, degrees=2.0):
     torch.testing.assert_close(canonical.root_position, wanted.root_position, atol=1e-6, rtol=0)
 
 
-def converted(wish, *, frames=40):
-    """A rig as wished, a walk on it, what of it comes out, and the walk itself."""
-    result, wanted = make(wish), person(wish.size, frames)
+def converted(rig_request, *, frames=40):
+    """A requested rig, a walk on it, the walk as it is read, and the walk itself."""
+    result, wanted = make(rig_request), person(rig_request.size, frames)
     motion = result.motion(wanted)
     return result, wanted, motion, *retarget.to_canonical(motion)
 
@@ -216,16 +216,16 @@ def test_the_static_root_of_an_original_stays():
 
 @pytest.mark.parametrize(("preset", "version", "arms"), [(*tree, 40 * (k % 2)) for k, tree in enumerate(TREES)])
 def test_a_rig_as_a_program_writes_it_is_known_and_comes_back(preset, version, arms):
-    wish = replace(TREES[preset, version], arms_down_deg=arms, extras=False)
-    result, wanted = make(wish), person(1.0, 30)
+    rig_request = replace(TREES[preset, version], arms_down_deg=arms, extras=False)
+    result, wanted = make(rig_request), person(1.0, 30)
     motion = result.motion(wanted)
     canonical, rigmap = retarget.to_canonical(motion)
     absent = CANONICAL.num_joints - len(result.joint)
     assert rigmap.rig.name == preset
     assert rigmap.match.score == pytest.approx(1.0 - 0.6 * absent / CANONICAL.num_joints)
     assert rigmap.joint_names == dict(result.joint)
-    assert (rigmap.rest, rigmap.up) == ("T" if arms == 0 else "A", "z" if wish.zup else "y")
-    facing = {(False, 0): "z", (False, 180): "-z", (True, 0): "-y"}[wish.zup, wish.turned_deg]
+    assert (rigmap.rest, rigmap.up) == ("T" if arms == 0 else "A", "z" if rig_request.zup else "y")
+    facing = {(False, 0): "z", (False, 180): "-z", (True, 0): "-y"}[rig_request.zup, rig_request.turned_deg]
     assert rigmap.facing == facing
     assert assess_fit(rigmap, motion).doubts == ()
     known = [CANONICAL.index(name) for name in result.joint]

@@ -68,7 +68,7 @@ def copy_action(armature: bpy.types.Object, name: str) -> bpy.types.Action:
 
 def open_curves(armature: bpy.types.Object):
     """Open what holds the curves and groups by which an action moves the armature: the action itself, or since 4.4 the
-    bag of its slot, which is made where there is none."""
+    bag of its slot, which is created where there is none."""
     action = find_action(armature)
     if not hasattr(action, "layers"):
         return action

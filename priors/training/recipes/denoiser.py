@@ -129,7 +129,7 @@ def _perturb_joint_frames(
 
 
 def compute_denoiser_losses(network: DenoiserNetwork, windows: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
-    """The loss, and in plain units the errors it is made of."""
+    """The loss, and in plain units the errors that add up to it."""
     clean = make_clean_capture(windows)
     cleaned = network(corrupt(clean, generator))
     angles = _pack_angles(clean)

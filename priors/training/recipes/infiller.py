@@ -116,7 +116,7 @@ class InfillerTrainer(GradientTrainer[InfillerNetwork]):
 
 
 def compute_infiller_losses(network: InfillerNetwork, window: Window, known: Tensor) -> dict[str, Tensor]:
-    """The loss, and in plain units the errors it is made of.
+    """The loss, and in plain units the errors that add up to it.
 
     L1 over the whole motion (Kaufmann et al. 2020, section 3.3), window by window divided by the number of coordinates
     that had to be filled: two joints that are lost count as much as a gap. A network that keeps what is known is so

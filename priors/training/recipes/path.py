@@ -97,7 +97,7 @@ class PathTrainer(GradientTrainer[PathNetwork]):
 
 
 def compute_path_losses(network: PathNetwork, motion: PartialMotion) -> dict[str, Tensor]:
-    """The loss, and in plain units the errors it is made of.
+    """The loss, and in plain units the errors that add up to it.
 
     Displacements over 1, 2, 4 to 64 frames count alike (Zhou et al. 2020, Eq. 5), but by their distance instead of its
     square, which a few runs would fill. A step's error is then penalised by what it sums up to.

@@ -223,7 +223,7 @@ def measure_error(network: PoseTransformerNetwork, truth: PartialMotion, known: 
 
 
 def compute_losses(network: PoseTransformerNetwork, truth: PartialMotion, hidden: PartialMotion) -> dict[str, Tensor]:
-    """Compute the loss, and in plain units the errors it is made of.
+    """Compute the loss, and in plain units the errors that add up to it.
 
     Distances, not squares, window by window divided by how many joints in how many frames are unknown: two lost joints
     count as much as a gap. They are the same however the motion is turned. Windows that interpolation nearly solves

@@ -370,7 +370,7 @@ def sample_nearest(network: StitcherNetwork, truth: Transition, generator: torch
 def find_stitcher_losses(
     network: StitcherNetwork, posterior: PosteriorNetwork, truth: Transition, generator: torch.Generator
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Find the losses by the names of their weights, and in plain units the errors that they are made of."""
+    """Find the losses by the names of their weights, and in plain units the errors that add up to them."""
     batch = len(truth.features)
     informed, calm, compared = (round(batch * share) for share in itertools.accumulate(SHARES.values()))
     row = torch.arange(batch)

@@ -474,7 +474,7 @@ def compute_tweener_losses(
     style_poses: Float[Tensor, "batch poses joints 3"],
     styled: Bool[Tensor, " batch"],
 ) -> dict[str, Tensor]:
-    """The loss, and in plain units the errors it is made of.
+    """The loss, and in plain units the errors that add up to it.
 
     Where a performer's poses between keys are known they count the less the farther the nearest key is, since more and
     more other motions would do as well.
