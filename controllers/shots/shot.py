@@ -79,8 +79,8 @@ def solve_shot(
     Where nothing but a walk is requested, no `inbetweener` is needed, and after `deadline_seconds` of wall clock, and
     at Ctrl-C, the solution so far is returned, with that status. `terms` are the caller's own, in every window of
     the walks; they see the character at its own size and the time since the first frame. On another `skeleton`
-    strides are as long as its legs, and the toes' rest height is that of the settings' footing. Constraints that do not hold
-    are named with numbers in the status, which is then infeasible.
+    strides are as long as its legs, and the toes' rest height is that of the settings' footing. Constraints that do
+    not hold are named with numbers in the status, which is then infeasible.
     """
     if inbetweener is None and not request.walks_only:
         raise RequestError("standing, reversing, keys and clips need an in-betweener, and none is given")
