@@ -74,4 +74,4 @@ def finish(facts: dict, arrays: dict | None = None) -> None:
     if arrays is not None:
         np.savez(FOLDER / "arrays.npz", **arrays)
     sys.stdout.flush()
-    os._exit(0)  # bpy 4.2 crashes as it is taken down where Rigify made a rig
+    os._exit(0)  # bpy 4.2 crashes as it is taken down where Rigify generated a rig

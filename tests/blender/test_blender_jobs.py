@@ -98,7 +98,7 @@ def test_what_is_sent_is_what_blender_shows(played):
 def test_what_comes_back_is_what_blender_shows(played):
     _, _, kept, facts, arrays = played
     for command, stage in last_stages(facts).items():
-        file = kept / command / "made.npz"
+        file = kept / command / "result.npz"
         result = joints(file, facts["joints"])
         assert np.abs(shown(arrays, stage, facts["joints"], file)[: len(result)] - result).max() < CLOSE
 
