@@ -16,9 +16,7 @@ RUNS = {
 }
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(each, marks=[pytest.mark.slow] * (each != "inbetween")) for each in RUNS]
-)
+@pytest.mark.parametrize("name", [pytest.param(each, marks=[pytest.mark.slow] * (each != "generate")) for each in RUNS])
 def test_a_script_prints_one_table(data, name, capsys):
     script, *flags = name.split()
     import_module(script).main(["--clips", str(data), "--count", "2", *flags, *RUNS[name]])

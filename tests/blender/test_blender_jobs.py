@@ -10,7 +10,7 @@ from tiny_prior import save_tiny_prior
 import mapctl
 from mapctl.commands.blender_addon import build_addon_zip
 
-pytestmark = needs_blender
+pytestmark = [needs_blender, pytest.mark.slow]
 
 CLOSE = 2e-5  # metres: Blender's single precision
 HEIGHT = 0.25  # metres of the curve over the ground
@@ -18,8 +18,8 @@ WRITTEN = {"clean": "denoise", "filled": "infill", "tweened": "tween", "again": 
 """Commands of the stages after the walk; of two that ran the same, the later one's files are left."""
 KINDS = [
     pytest.param(("imported", True, 24, 5), id="imported"),
-    pytest.param(("generated", True, 30, 4), id="generated", marks=pytest.mark.slow),
-    pytest.param(("metarig", False, 24, 5), id="metarig", marks=pytest.mark.slow),
+    pytest.param(("generated", True, 30, 4), id="generated"),
+    pytest.param(("metarig", False, 24, 5), id="metarig"),
 ]
 
 

@@ -107,7 +107,7 @@ def test_the_same_seed_gives_the_same_bits_and_leaves_torch_alone():
 @pytest.mark.slow
 def test_too_few_or_too_short_clips_are_refused():
     clips = clip_set(8, 31)
-    with pytest.raises(RequestError, match="at least 8 clips of each, made and mocap; got 7 and 8"):
+    with pytest.raises(RequestError, match="at least 8 clips of each, generated and mocap; got 7 and 8"):
         realism.measure_realism(clips[:7], clips, generator=generator())
     with pytest.raises(RequestError, match="20 frames"):
         realism.measure_realism(clips, [*clips[:2], walk(20), *clips[3:]], generator=generator())

@@ -121,6 +121,7 @@ def recorded(page, tmp_path, seconds: float) -> mapctl.Motion:
     return mapctl.load(path)
 
 
+@pytest.mark.slow
 def test_a_walk_through_the_page(prior, tmp_path):
     show = Live("--prior", prior)
     with open_page(show.url) as page:

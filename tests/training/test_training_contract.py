@@ -189,6 +189,7 @@ def test_a_step_in_bfloat16_has_the_loss_of_one_in_float32_nearly(name, data, pr
     parts, losses = small_settings(name, data, tmp_path, prior).gather(), []
     for reduced in (False, True):
         trainer = small_settings(name, data, tmp_path, prior, bfloat16=reduced).make_trainer(parts)
+        trainer.train_step()  # heads that begin at zero hide the precision of the first step's loss
         losses.append(trainer.train_step()["loss"])
     assert losses[0] != losses[1]
     assert losses[0] == pytest.approx(losses[1], rel=0.05, abs=0.05)
