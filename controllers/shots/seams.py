@@ -14,8 +14,9 @@ from torch import Tensor
 
 from controllers.common.map_refinement import estimate_rest_height
 from controllers.inbetweening.pipeline import InfillSettings, fill
+from controllers.shots.footsteps import Displacement, Footstep, plan_footsteps, take_steps
 from controllers.shots.request import Arrival, Lead
-from controllers.shots.trajectory import Span
+from controllers.shots.trajectory import Span, Trajectory
 from controllers.shots.walk import Piece
 from mapctl import contacts
 from mapctl.features import PRIOR_FPS
@@ -106,6 +107,14 @@ def _join_across(before: Motion, after: Motion, frame: int) -> Motion:
     )
 
 
+def _insert(motion: Motion, part: Motion, start: int) -> Motion:
+    """Replace the frames from `start` on by those of a part."""
+    frames = slice(start, start + part.num_frames)
+    root, quats = motion.root_position.clone(), motion.local_quat_xyzw.clone()
+    root[frames], quats[frames] = part.root_position.to(root), part.local_quat_xyzw.to(quats)
+    return replace(motion, root_position=root, local_quat_xyzw=quats)
+
+
 def fill_frames(motion: Motion, missing: Bool[Tensor, " frames"], inbetweener: Inbetweener) -> Motion:
     """Generate whole frames of a motion."""
     return fill(motion, MissingMask.of_frames(missing, motion.num_joints), inbetweener).motion
@@ -117,12 +126,22 @@ _HASTY = 20  # frames of a transition for which there is no room
 _SETTLED = 8  # frames that are left of a walk between two transitions
 
 
-def join_pieces(pieces: Sequence[Piece], inbetweener: Inbetweener) -> tuple[Motion, Bool[Tensor, " frames"]]:
-    """Join pieces by the transitions that cost least; also return the frames that the in-betweener is to generate."""
-    joined = pieces[0].motion
+def join_pieces(
+    pieces: Sequence[Piece], trajectory: Trajectory, inbetweener: Inbetweener
+) -> tuple[Motion, Bool[Tensor, " frames"], list[Footstep]]:
+    """Join pieces: two stands by footsteps, others by the transitions that cost least. Also return the frames that the
+    in-betweener is to generate, and the footsteps."""
+    joined, footsteps = pieces[0].motion, list[Footstep]()
     missing = torch.zeros(joined.num_frames, dtype=torch.bool)
     earliest = 0
     for before, after in pairwise(pieces):
+        if before.span.what == after.span.what == "stand":
+            start, steps, plan = _step_across(before, after, trajectory, earliest)
+            stop = start + steps.num_frames - 1
+            joined = _insert(_join_across(joined, after.motion, stop), steps, start)
+            footsteps += plan
+            earliest = stop
+            continue
         candidates = [
             Filling.of_frames(_join_across(joined, after.motion, start), start, stop)
             for start, stop in _lay_transitions(before.span, after.span, joined.num_frames, earliest)
@@ -131,7 +150,25 @@ def join_pieces(pieces: Sequence[Piece], inbetweener: Inbetweener) -> tuple[Moti
         joined, (start, stop) = chosen.motion, chosen.around
         missing[start:stop] = True
         earliest = stop + _SETTLED
-    return joined, missing
+    return joined, missing, footsteps
+
+
+def _step_across(
+    before: Piece, after: Piece, trajectory: Trajectory, earliest: int
+) -> tuple[int, Motion, list[Footstep]]:
+    """Step from one stand to the next along a trajectory; return the first frame, the motion and the footsteps. Where
+    speeds give too little time, the stands do."""
+    frames = after.motion.num_frames
+    first = max(earliest, before.span.start + (_STILL_START if before.span.start == 0 else 1))
+    latest = frames - _STILL_END if after.span.stop == frames else after.span.stop - 1
+    left, reached = before.span.stop - 1, after.span.start
+    ends = [piece.motion.slice(at, at + 1) for piece, at in ((before, left), (after, reached))]
+    displacement = Displacement.along(trajectory.curve, trajectory.arcs[[left, reached]], ends[0], ends[1])
+    short = displacement.count_frames() - (reached - left + 1)
+    start = max(min(left, first), left - max(0, short) // 2)
+    stop = min(max(reached, latest), start + max(reached - start, displacement.count_frames() - 1))
+    plan = plan_footsteps(displacement, stop - start + 1)
+    return start, take_steps(displacement, plan, stop - start + 1), [step.later(start) for step in plan]
 
 
 def _lay_transitions(before: Span, after: Span, frames: int, earliest: int) -> list[tuple[int, int]]:

@@ -15,6 +15,7 @@ import torch
 from controllers.common.character import Character
 from controllers.inbetweening.pipeline import fill
 from controllers.shots.constraints import Constraint, check_constraints, describe_conflicts
+from controllers.shots.footsteps import Footstep
 from controllers.shots.reaching import (
     MetPose,
     ReachTargets,
@@ -57,9 +58,15 @@ class ShotSolution(Solution):
     met: tuple[MetPose, ...] = ()
     """Keys of poses, positions and facings, as they were met."""
 
+    footsteps: tuple[Footstep, ...] = ()
+    """Steps between stands that no walk connects, in frames of the motion."""
+
     def details(self) -> dict:
-        """Return the constraints."""
-        return {"constraints": [constraint.as_row() for constraint in self.constraints]}
+        """Return the constraints and the footsteps."""
+        return {
+            "constraints": [constraint.as_row() for constraint in self.constraints],
+            "footsteps": [step.as_row() for step in self.footsteps],
+        }
 
 
 def solve_shot(
@@ -108,9 +115,9 @@ def solve_shot(
         progress=progress,
         deadline=None if deadline_seconds is None else time.monotonic() + deadline_seconds,
     )
-    motion, reaches, met = pieces[0].motion, request.reaches, ()
+    motion, reaches, met, footsteps = pieces[0].motion, request.reaches, (), []
     if inbetweener is not None:
-        motion, missing = join_pieces(pieces, inbetweener)
+        motion, missing, footsteps = join_pieces(pieces, trajectory, inbetweener)
         motion = _finish_ends(motion, missing, request, trajectory, inbetweener)
         motion, reaches, met = _meet_keys(motion, request, trajectory, inbetweener)
     notes = [trajectory.note] if trajectory.note else []
@@ -132,6 +139,7 @@ def solve_shot(
         constraints=constraints,
         reaches=reaches,
         met=met,
+        footsteps=tuple(footsteps),
     )
 
 

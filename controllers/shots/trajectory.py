@@ -113,7 +113,8 @@ def _smooth_offsets(free: ndarray, offsets: ndarray, chosen: ndarray) -> ndarray
 
 _STANDING_SPEED = 0.05  # m/s
 _WALKING_SHARE = 0.7  # of the fastest speed beside a stand, at which the density walks already
-_SHORTEST_WALK = 15  # frames: a shorter one is a step that the in-betweener generates
+_SHORTEST_WALK = 15  # frames, without a stand on either side
+_SHORTEST_BETWEEN_STANDS = 30  # frames, less than two steps: footsteps lead from one stand to the next instead
 
 
 @dataclass(frozen=True)
@@ -145,7 +146,8 @@ def lay_timeline(speeds: Float[Tensor, " frames"], *, slowest: float) -> list[Sp
             fast = before + (speeds[before:start] >= enough).nonzero()[:, 0]
             if len(fast):
                 first, last = int(fast[0]) if before > 0 else 0, int(fast[-1]) + 1 if start < frames else frames
-                if last - first >= _SHORTEST_WALK:
+                between = before > 0 and start < frames
+                if last - first >= (_SHORTEST_BETWEEN_STANDS if between else _SHORTEST_WALK):
                     spans.append(Span("walk", first, last))
         if stop > start:
             spans.append(Span("stand", start, stop))

@@ -1,0 +1,271 @@
+"""Footsteps: where and when feet stand while a standing body is displaced, or turned, over too little for a walk.
+
+The plan comes before any pose: how many steps, by which foot first, at which footholds. These are discrete choices with
+basins of their own, so all plans are compared. Poses follow the plan: toes planted or in swing, hips over the support,
+legs by inverse kinematics.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from mapctl import kinematics, rotations
+from mapctl.curves import Curve
+from mapctl.features import PRIOR_FPS
+from mapctl.kinematics import inverse
+from mapctl.motion import Motion
+from mapctl.numerics import gaussian
+from mapctl.numerics.easing import smootherstep
+from mapctl.skeleton import CANONICAL, FEET, LIMBS, TOES, leg_length
+
+_LEGS = [LIMBS[name] for name in FEET]
+_SWING, _BOTH = 13, 4  # frames at PRIOR_FPS of a swing, and of double support before and after it
+_STEP, _TURN = 0.7, math.radians(75.0)  # of legs' length, and radians, that a foot is put ahead of the other at most
+_SLOWEST = 45  # frames of a step at most: where there is more time, there are more steps
+_TRACK_STEP = 0.05  # metres between the points of a track
+_MOVED, _TURNED = 0.02, math.radians(4.0)  # metres and radians from which on a foot is lifted
+_NARROWEST = 0.08  # metres between the ankles, sideways: less is a foot that crosses the other
+
+
+@dataclass(frozen=True)
+class Footstep:
+    """A swing of one foot to its next foothold."""
+
+    foot: int
+    """0 is left, 1 is right."""
+    lift: int
+    """Last frame, at PRIOR_FPS, in which the foot stands before."""
+    land: int
+    """First frame in which it stands again."""
+    share: float
+    """Share of the displacement at which a body stands squarely over the foothold."""
+    toe: tuple[float, float] = (0.0, 0.0)
+    """Toe joint on the foothold, x and z, world, metres."""
+
+    def later(self, frames: int) -> "Footstep":
+        """Return the step so many frames later."""
+        return replace(self, lift=self.lift + frames, land=self.land + frames)
+
+    def as_row(self) -> dict[str, Any]:
+        """Return the row of a report: foot, seconds of lift and landing, toe joint."""
+        seconds = {"lift_s": self.lift / PRIOR_FPS, "land_s": self.land / PRIOR_FPS}
+        return {"foot": ("left", "right")[self.foot], **seconds, "toe": list(self.toe)}
+
+
+@dataclass(frozen=True, eq=False)
+class Displacement:
+    """A body brought from one stance to another."""
+
+    start: Motion
+    """Pose at its start, one frame."""
+    stop: Motion
+    """Pose at its end, one frame."""
+    track: Float[Tensor, "points 3"]
+    """Hips along it at even shares: x and z, metres, and heading, radians, without jumps of a turn."""
+
+    @staticmethod
+    def along(curve: Curve, arcs: Float[Tensor, "2"], start: Motion, stop: Motion) -> "Displacement":
+        """Displace a body along a curve between two arcs, metres; the ends are those of the poses."""
+        points = max(2, math.ceil(float(arcs[1] - arcs[0]) / _TRACK_STEP) + 1)
+        at, share = (
+            torch.lerp(arcs[0], arcs[1], torch.linspace(0, 1, points, dtype=arcs.dtype)),
+            torch.linspace(0, 1, points),
+        )
+        heading = curve.heading(at)
+        track = torch.cat([curve.ground_point(at), heading[:, None]], dim=-1)
+        ends = [
+            torch.cat([pose.root_position[0, ::2], kinematics.heading(pose.local_quat_xyzw[:, 0])])
+            for pose in (start, stop)
+        ]
+        off = torch.stack([end.to(track) - track[at] for end, at in zip(ends, (0, -1), strict=True)])
+        track = track + torch.lerp(off[0], off[1], share.to(track)[:, None])
+        track[:, 2] = rotations.unwrap_angle(track[:, 2])
+        return Displacement(start, stop, track)
+
+    @property
+    def distance(self) -> float:
+        """Length of the hips' track, metres."""
+        return float(torch.diff(self.track[:, :2], dim=0).norm(dim=-1).sum())
+
+    @property
+    def turn(self) -> float:
+        """Angle that the hips turn by, radians."""
+        return float(torch.diff(self.track[:, 2]).abs().sum())
+
+    def count_steps(self) -> int:
+        """Count the steps that it takes at least: the first and the last are half of one between."""
+        length = _STEP * leg_length(self.start.skeleton)
+        return 1 + max(1, math.ceil(self.distance / length - 1e-6), math.ceil(self.turn / _TURN - 1e-6))
+
+    def count_frames(self) -> int:
+        """Count the frames at PRIOR_FPS that an unhurried pace takes."""
+        return 1 + self.count_steps() * (_SWING + _BOTH) + _BOTH
+
+    def hips_at(self, share: Float[Tensor, " n"]) -> Float[Tensor, "n 3"]:
+        """Interpolate the track at shares."""
+        at = share.clamp(0, 1) * (len(self.track) - 1)
+        low = at.floor().long().clamp(max=len(self.track) - 2)
+        return torch.lerp(self.track[low], self.track[low + 1], (at - low)[:, None])
+
+    def toes_at(self, foot: int, share: Float[Tensor, " n"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"]]:
+        """Return position of the toe joint and rotation of the foot, world, of one that stands at shares."""
+        hips = self.hips_at(share)
+        at, turns = [], []
+        for pose in (self.start, self.stop):
+            positions, quats = _forward(pose)
+            heading = kinematics.heading(pose.local_quat_xyzw[:, 0])
+            offset = positions[:, CANONICAL.index(TOES[foot])] - pose.root_position * pose.root_position.new_tensor(
+                [1, 0, 1]
+            )
+            at.append(rotations.rotate_about_y(offset, -heading))
+            turns.append(rotations.multiply(rotations.about_y(-heading), quats[:, CANONICAL.index(FEET[foot])]))
+        offset = torch.lerp(at[0], at[1], share[:, None])
+        turned = rotations.slerp(turns[0].expand(len(share), 4), turns[1].expand(len(share), 4), share)
+        ground = rotations.lift_ground(hips[:, :2])
+        return (
+            ground + rotations.rotate_about_y(offset, hips[:, 2]),
+            rotations.multiply(rotations.about_y(hips[:, 2]), turned),
+        )
+
+
+def _forward(motion: Motion) -> tuple[Tensor, Tensor]:
+    skeleton = motion.skeleton
+    return kinematics.forward_kinematics(
+        skeleton.offsets, skeleton.parents, motion.root_position, motion.local_quat_xyzw
+    )
+
+
+def plan_footsteps(displacement: Displacement, frames: int) -> list[Footstep]:
+    """Plan the steps of a displacement within so many frames at PRIOR_FPS; none where no foot has to move.
+
+    Feet alternate. Of the plans that begin with either foot the one counts whose feet are least apart at most, and do
+    not cross: the first is on the side to which the body turns or steps.
+    """
+    if displacement.distance < _MOVED and displacement.turn < _TURNED:
+        return []
+    count = max(displacement.count_steps(), frames // _SLOWEST)
+    plans = [_lay_steps([(first + number) % 2 for number in range(count)], frames) for first in range(2)]
+    plan = min(plans, key=lambda plan: _measure_strain(displacement, plan))
+    shares = torch.tensor([step.share for step in plan], dtype=torch.float64)
+    toes = [displacement.toes_at(foot, shares)[0][:, ::2].tolist() for foot in range(2)]
+    return [replace(step, toe=tuple(toes[step.foot][number])) for number, step in enumerate(plan)]
+
+
+def _lay_steps(feet: Sequence[int], frames: int) -> list[Footstep]:
+    count = len(feet)
+    swing = (frames - 1) / (count + (count + 1) * _BOTH / _SWING)
+    both, plan = swing * _BOTH / _SWING, list[Footstep]()
+    for number, foot in enumerate(feet):
+        lift = both + number * (swing + both)
+        share = min(1.0, (number + 1) / max(1, count - 1))
+        plan.append(Footstep(foot, round(lift), round(lift + swing), share))
+    return plan
+
+
+def _measure_strain(displacement: Displacement, plan: Sequence[Footstep]) -> float:
+    """Measure the largest distance between feet that stand, metres, and by how much they cross."""
+    held, most = [0.0, 0.0], 0.0
+    for step in plan:
+        held[step.foot] = step.share
+        left, right = (displacement.toes_at(foot, torch.tensor([held[foot]], dtype=torch.float64)) for foot in range(2))
+        apart = (left[0] - right[0])[:, ::2]
+        heading = displacement.hips_at(torch.tensor([held[1 - step.foot]], dtype=torch.float64))[:, 2]
+        aside = float(rotations.rotate_ground(apart, -heading)[0, 0])
+        most = max(most, float(apart.norm()) + 4 * max(0.0, _NARROWEST - aside))
+    return most
+
+
+_CLEARANCE = 0.035  # metres of the toe in mid-swing over its rest height, as of walking people (see terms.Clearance)
+_TOE_OFF, _TOE_OFF_METRE = math.radians(35.0), math.radians(60.0)  # pitch of a foot as it leaves, at most and per metre
+_ROLL = 4  # frames over which a heel rises while the toe stands
+_SWAY = 0.02  # metres by which hips go aside to the foot that stands
+_STRETCHED = 0.985  # share of a leg's length at which its hip goes lower
+_SMOOTH = 3.0  # frames (sigma) over which hips follow their support
+
+
+def take_steps(displacement: Displacement, plan: Sequence[Footstep], frames: int) -> Motion:
+    """Pose a body that follows a plan: the first frame is the displacement's start, the last its stop.
+
+    Hips are over the mean of both feet, and somewhat to the one that stands; they are as high as before and after,
+    but lower where a leg would be stretched. Trunk and arms go from one pose to the other.
+    """
+    start, stop = displacement.start, displacement.stop
+    clock = torch.arange(frames, dtype=torch.float64)
+    toes, turns, shares, sways = [], [], [], torch.zeros(frames, dtype=torch.float64)
+    for foot in range(2):
+        share = torch.zeros(frames, dtype=torch.float64)
+        lifted, pitch, held = torch.zeros_like(share), torch.zeros_like(share), 0.0
+        for step in (step for step in plan if step.foot == foot):
+            swing = (clock - step.lift) / (step.land - step.lift)
+            share = share + (step.share - held) * smootherstep(swing)
+            ends = displacement.toes_at(foot, torch.tensor([held, step.share], dtype=torch.float64))[0]
+            away = float((ends[1] - ends[0]).norm())
+            lifted = lifted + _CLEARANCE * torch.sin(math.pi * swing.clamp(0, 1)).square()
+            rise = (clock - step.lift + _ROLL) / (_ROLL + 0.6 * (step.land - step.lift))
+            pitch = pitch + min(_TOE_OFF, _TOE_OFF_METRE * away) * torch.sin(math.pi * rise.clamp(0, 1)).square()
+            sways = sways + (-1.0 if foot == 0 else 1.0) * _SWAY * torch.sin(math.pi * swing.clamp(0, 1)).square()
+            held = step.share
+        position, turn = displacement.toes_at(foot, share)
+        toes.append(position + torch.stack([0 * lifted, lifted, 0 * lifted], dim=-1))
+        down = torch.stack([pitch, 0 * pitch, 0 * pitch], dim=-1)
+        turns.append(rotations.multiply(turn, rotations.from_rotation_vector(down)))
+        shares.append(share)
+    share = _smooth_between((shares[0] + shares[1]) / 2)
+    hips = displacement.hips_at(share)
+    aside = rotations.rotate_ground(torch.stack([_smooth_between(sways), 0 * sways], dim=-1), hips[:, 2])
+    weight = smootherstep(clock / (frames - 1))
+    root = torch.lerp(start.root_position, stop.root_position, weight[:, None])
+    root = torch.stack([hips[:, 0] + aside[:, 0], root[:, 1], hips[:, 1] + aside[:, 1]], dim=-1)
+    first, last = (_without_heading(pose) for pose in (start, stop))
+    quats = rotations.slerp(
+        first.expand(frames, -1, 4), last.expand(frames, -1, 4), weight[:, None].expand(frames, first.shape[1])
+    )
+    quats = torch.cat([rotations.multiply(rotations.about_y(hips[:, 2]), quats[:, 0])[:, None], quats[:, 1:]], dim=1)
+    motion = replace(start, root_position=root, local_quat_xyzw=quats)
+    return _stand_on(motion, torch.stack(toes, dim=1), torch.stack(turns, dim=1))
+
+
+def _without_heading(pose: Motion) -> Float[Tensor, "1 joints 4"]:
+    quats = pose.local_quat_xyzw.double().clone()
+    quats[:, 0] = rotations.split_heading(quats[:, 0])[1]
+    return quats
+
+
+def _smooth_between(values: Float[Tensor, " frames"]) -> Float[Tensor, " frames"]:
+    """Smooth over time; the first and the last value stay."""
+    smooth = gaussian.smooth(values[:, None], _SMOOTH)[:, 0]
+    weight = torch.linspace(0, 1, len(values), dtype=values.dtype)
+    return smooth + (1 - weight) * (values[0] - smooth[0]) + weight * (values[-1] - smooth[-1])
+
+
+def _stand_on(motion: Motion, toes: Float[Tensor, "frames 2 3"], turns: Float[Tensor, "frames 2 4"]) -> Motion:
+    """Bring the feet of a motion to positions of the toe joints and rotations in the world; hips go lower where a leg
+    does not reach."""
+    skeleton, positions = motion.skeleton, motion.joint_positions()
+    lower, ankles = torch.zeros(motion.num_frames, dtype=torch.float64), []
+    for foot, limb in enumerate(_LEGS):
+        offset = skeleton.offsets[CANONICAL.index(TOES[foot])].to(toes)
+        ankles.append(toes[:, foot] - rotations.rotate(turns[:, foot], offset.expand(len(toes), 3)))
+        away = positions[:, limb.upper] - ankles[foot]
+        reached = max(_STRETCHED * limb.length(skeleton), *away[[0, -1]].norm(dim=-1).tolist())
+        highest = (reached**2 - away[:, ::2].square().sum(dim=-1)).clamp_min(0).sqrt()
+        lower = torch.maximum(lower, away[:, 1] - highest)
+    lower = torch.nn.functional.max_pool1d(lower[None], 9, 1, 4)[0]
+    lower[[0, -1]] = 0.0
+    lower = _smooth_between(lower)
+    root = motion.root_position - torch.stack([0 * lower, lower, 0 * lower], dim=-1)
+    motion = replace(motion, root_position=root)
+    positions, world = _forward(motion)
+    quats = motion.local_quat_xyzw.clone()
+    for foot, limb in enumerate(_LEGS):
+        aim = ankles[foot] - positions[:, limb.upper]
+        turn, bent = inverse.reach(limb, world[:, limb.upper], quats[:, limb.lower], aim, skeleton.offsets.to(toes))
+        quats[:, limb.upper] = rotations.multiply(rotations.inverse(world[:, 0]), turn)
+        quats[:, limb.lower] = bent
+        quats[:, limb.end] = rotations.multiply(rotations.inverse(rotations.multiply(turn, bent)), turns[:, foot])
+    return replace(motion, local_quat_xyzw=rotations.make_sign_continuous(quats))
