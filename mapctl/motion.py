@@ -107,6 +107,10 @@ class Motion:
             raise RequestError(f"frames {start}:{stop} are not within 0:{self.num_frames}")
         return self._map_frames(lambda values: values[start:stop])
 
+    def reverse(self) -> "Motion":
+        """Return the motion backward in time."""
+        return self._map_frames(lambda values: values.flip(0))
+
     def join(self, other: "Motion") -> "Motion":
         """Join this motion and `other`, which must have the same skeleton and frame rate; nothing is moved."""
         if not self.skeleton.matches(other.skeleton) or self.fps != other.fps:

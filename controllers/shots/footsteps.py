@@ -51,6 +51,10 @@ class Footstep:
         """Return the step so many frames later."""
         return replace(self, lift=self.lift + frames, land=self.land + frames)
 
+    def reverse(self, frames: int) -> "Footstep":
+        """Return the step of a motion of so many frames, backward in time."""
+        return replace(self, lift=frames - 1 - self.land, land=frames - 1 - self.lift)
+
     def as_row(self) -> dict[str, Any]:
         """Return the row of a report: foot, seconds of lift and landing, toe joint."""
         seconds = {"lift_s": self.lift / PRIOR_FPS, "land_s": self.land / PRIOR_FPS}
@@ -117,11 +121,9 @@ class Displacement:
         hips = self.hips_at(share)
         at, turns = [], []
         for pose in (self.start, self.stop):
-            positions, quats = _forward(pose)
+            positions, quats = pose.joint_positions(), pose.joint_rotations()
             heading = kinematics.heading(pose.local_quat_xyzw[:, 0])
-            offset = positions[:, CANONICAL.index(TOES[foot])] - pose.root_position * pose.root_position.new_tensor(
-                [1, 0, 1]
-            )
+            offset = positions[:, CANONICAL.index(TOES[foot])] - rotations.lift_ground(pose.root_position[:, ::2])
             at.append(rotations.rotate_about_y(offset, -heading))
             turns.append(rotations.multiply(rotations.about_y(-heading), quats[:, CANONICAL.index(FEET[foot])]))
         offset = torch.lerp(at[0], at[1], share[:, None])
@@ -131,13 +133,6 @@ class Displacement:
             ground + rotations.rotate_about_y(offset, hips[:, 2]),
             rotations.multiply(rotations.about_y(hips[:, 2]), turned),
         )
-
-
-def _forward(motion: Motion) -> tuple[Tensor, Tensor]:
-    skeleton = motion.skeleton
-    return kinematics.forward_kinematics(
-        skeleton.offsets, skeleton.parents, motion.root_position, motion.local_quat_xyzw
-    )
 
 
 def plan_footsteps(displacement: Displacement, frames: int) -> list[Footstep]:
@@ -182,7 +177,7 @@ def _measure_strain(displacement: Displacement, plan: Sequence[Footstep]) -> flo
 
 _CLEARANCE = 0.035  # metres of the toe in mid-swing over its rest height, as of walking people (see terms.Clearance)
 _TOE_OFF, _TOE_OFF_METRE = math.radians(35.0), math.radians(60.0)  # pitch of a foot as it leaves, at most and per metre
-_ROLL = 4  # frames over which a heel rises while the toe stands
+_ROLL, _LONG_ROLL = 4, 8  # frames over which a heel rises while the toe stands: in a step, and at the end of a walk
 _SWAY = 0.02  # metres by which hips go aside to the foot that stands
 _STRETCHED = 0.985  # share of a leg's length at which its hip goes lower
 _SMOOTH = 3.0  # frames (sigma) over which hips follow their support
@@ -199,7 +194,7 @@ def take_steps(displacement: Displacement, plan: Sequence[Footstep], frames: int
     toes, turns, shares, sways = [], [], [], torch.zeros(frames, dtype=torch.float64)
     for foot in range(2):
         share = torch.zeros(frames, dtype=torch.float64)
-        lifted, pitch, held = torch.zeros_like(share), torch.zeros_like(share), 0.0
+        lifted, pitches, held = torch.zeros_like(share), list[tuple[Tensor, float]](), 0.0
         for step in (step for step in plan if step.foot == foot):
             swing = (clock - step.lift) / (step.land - step.lift)
             share = share + (step.share - held) * smootherstep(swing)
@@ -207,13 +202,14 @@ def take_steps(displacement: Displacement, plan: Sequence[Footstep], frames: int
             away = float((ends[1] - ends[0]).norm())
             lifted = lifted + _CLEARANCE * torch.sin(math.pi * swing.clamp(0, 1)).square()
             rise = (clock - step.lift + _ROLL) / (_ROLL + 0.6 * (step.land - step.lift))
-            pitch = pitch + min(_TOE_OFF, _TOE_OFF_METRE * away) * torch.sin(math.pi * rise.clamp(0, 1)).square()
+            pitches.append((rise, away))
             sways = sways + (-1.0 if foot == 0 else 1.0) * _SWAY * torch.sin(math.pi * swing.clamp(0, 1)).square()
             held = step.share
         position, turn = displacement.toes_at(foot, share)
         toes.append(position + torch.stack([0 * lifted, lifted, 0 * lifted], dim=-1))
-        down = torch.stack([pitch, 0 * pitch, 0 * pitch], dim=-1)
-        turns.append(rotations.multiply(turn, rotations.from_rotation_vector(down)))
+        for rise, away in pitches:
+            turn = _pitch(turn, rise, away)
+        turns.append(turn)
         shares.append(share)
     share = _smooth_between((shares[0] + shares[1]) / 2)
     hips = displacement.hips_at(share)
@@ -228,6 +224,13 @@ def take_steps(displacement: Displacement, plan: Sequence[Footstep], frames: int
     quats = torch.cat([rotations.multiply(rotations.about_y(hips[:, 2]), quats[:, 0])[:, None], quats[:, 1:]], dim=1)
     motion = replace(start, root_position=root, local_quat_xyzw=quats)
     return _stand_on(motion, torch.stack(toes, dim=1), torch.stack(turns, dim=1))
+
+
+def _pitch(turn: Float[Tensor, "frames 4"], rise: Float[Tensor, " frames"], away: float) -> Float[Tensor, "frames 4"]:
+    """Pitch a foot down over shares 0 to 1 of its toe-off, the more the farther it goes, metres."""
+    pitch = min(_TOE_OFF, _TOE_OFF_METRE * away) * torch.sin(math.pi * rise.clamp(0, 1)).square()
+    down = torch.stack([pitch, 0 * pitch, 0 * pitch], dim=-1)
+    return rotations.multiply(turn, rotations.from_rotation_vector(down))
 
 
 def _without_heading(pose: Motion) -> Float[Tensor, "1 joints 4"]:
@@ -260,7 +263,7 @@ def _stand_on(motion: Motion, toes: Float[Tensor, "frames 2 3"], turns: Float[Te
     lower = _smooth_between(lower)
     root = motion.root_position - torch.stack([0 * lower, lower, 0 * lower], dim=-1)
     motion = replace(motion, root_position=root)
-    positions, world = _forward(motion)
+    positions, world = motion.joint_positions(), motion.joint_rotations()
     quats = motion.local_quat_xyzw.clone()
     for foot, limb in enumerate(_LEGS):
         aim = ankles[foot] - positions[:, limb.upper]
@@ -269,3 +272,103 @@ def _stand_on(motion: Motion, toes: Float[Tensor, "frames 2 3"], turns: Float[Te
         quats[:, limb.lower] = bent
         quats[:, limb.end] = rotations.multiply(rotations.inverse(rotations.multiply(turn, bent)), turns[:, foot])
     return replace(motion, local_quat_xyzw=rotations.make_sign_continuous(quats))
+
+
+_FASTEST_LANDING, _SETTLE = 7, 13  # frames of a swing that is under way already, at least; of one from the ground
+_AIRBORNE = 0.5  # m/s of a toe, from which on it is in its swing
+_AHEAD = 1.9  # times that a swing under way takes longer than at its speed, so that it ends at rest
+
+
+@dataclass(frozen=True, eq=False)
+class LastSteps:
+    """The steps of a walk that comes to a stand: the swing that is under way, and the other foot beside it."""
+
+    motion: Motion
+    """Walk up to frame `start`, stand from `stop` on; between them the body is given, and feet are not."""
+    start: int
+    """Last frame of the walk."""
+    stop: int
+    """First frame of the stand."""
+
+    def plan(self) -> list[Footstep]:
+        """Plan both steps: the foot that swings, or the one behind, lands; then the other one follows."""
+        toes, speeds = self._toes, self._velocities.norm(dim=-1)
+        away = (toes[self.stop] - toes[self.start]).norm(dim=-1)
+        first = int(speeds.argmax()) if float(speeds.max()) > _AIRBORNE else int(away.argmax())
+        swing = _SETTLE
+        if float(speeds[first]) > _AIRBORNE:
+            swing = round(_AHEAD * float(away[first] / speeds[first]) * PRIOR_FPS)
+            swing = max(_FASTEST_LANDING, min(_SETTLE, swing))
+        landed = min(self.start + swing, self.stop - 2)
+        last = min(self.stop, landed + 1 + max(_SETTLE, 2))
+        steps = [Footstep(first, self.start, landed, 1.0), Footstep(1 - first, landed + 1, last, 1.0)]
+        ground = toes[self.stop][:, ::2].tolist()
+        return [replace(step, toe=tuple(ground[step.foot])) for step in steps if float(away[step.foot]) > _MOVED]
+
+    def measure_strain(self) -> float:
+        """Measure by how much the steps are longer than comfortable, metres: the first foot ahead of the other one, and
+        how far that has to swing; going backward counts too."""
+        plan, toes = self.plan(), self._toes[..., ::2]
+        if not plan:
+            return 0.0
+        first, (begin, end) = plan[0].foot, (toes[self.start], toes[self.stop])
+        most = _STEP * leg_length(self.motion.skeleton)
+        travel = self.motion.root_position[self.stop, ::2] - self.motion.root_position[self.start, ::2]
+        ahead = torch.nn.functional.normalize(travel, dim=0)
+        back = float(((begin - end) @ ahead).clamp_min(0).sum())
+        apart, swing = ((end[foot] - begin[1 - first]).norm() for foot in (first, 1 - first))
+        return back + max(0.0, float(apart) - most) + max(0.0, float(swing) - most)
+
+    def take(self) -> Motion:
+        """Bring the feet along the steps; hips go lower where a leg does not reach."""
+        part = slice(self.start, self.stop + 1)
+        clock = torch.arange(self.start, self.stop + 1, dtype=torch.float64)
+        rotation = self.motion.joint_rotations()
+        toes, turns = self._toes[part].clone(), []
+        for foot in range(2):
+            begin, end = self._toes[self.start, foot], self._toes[self.stop, foot]
+            one, other = (rotation[at, CANONICAL.index(FEET[foot])] for at in (self.start, self.stop))
+            step = next((step for step in self.plan() if step.foot == foot), None)
+            lift, land = (self.start, self.stop) if step is None else (step.lift, step.land)
+            swing = (clock - lift) / (land - lift)
+            under_way = lift == self.start and step is not None
+            velocity = self._velocities[foot] * (land - lift) / PRIOR_FPS if under_way else torch.zeros(3)
+            toes[:, foot] = _swing_to(begin, velocity.to(begin), end, swing)
+            turn = rotations.slerp(one.expand(len(clock), 4), other.expand(len(clock), 4), smootherstep(swing))
+            if step is not None:
+                rest = torch.lerp(begin[1], end[1], smootherstep(swing))
+                toes[:, foot, 1] = _clear_ground(toes[:, foot, 1], rest, swing)
+            if step is not None and not under_way:  # the heel rises while the body goes on over the toe
+                rise = (clock - lift + _LONG_ROLL) / (_LONG_ROLL + 0.6 * (land - lift))
+                turn = _pitch(turn, rise, float((end - begin).norm()))
+            turns.append(turn)
+        frames = self.motion.slice(self.start, self.stop + 1)
+        return _stand_on(frames, toes, torch.stack(turns, dim=1))
+
+    @property
+    def _toes(self) -> Float[Tensor, "frames 2 3"]:
+        return self.motion.joint_positions()[:, list(CANONICAL.indices(TOES))]
+
+    @property
+    def _velocities(self) -> Float[Tensor, "2 3"]:
+        """Velocities of the toes in the walk's last frame, m/s."""
+        return (self._toes[self.start] - self._toes[self.start - 1]) * PRIOR_FPS
+
+
+def _swing_to(
+    begin: Float[Tensor, "3"], velocity: Float[Tensor, "3"], end: Float[Tensor, "3"], share: Float[Tensor, " frames"]
+) -> Float[Tensor, "frames 3"]:
+    """Go from one point, at a velocity per unit of the share, to rest at another: minimum jerk (Flash and Hogan 1985),
+    from no acceleration."""
+    share, away = share.clamp(0, 1)[:, None], end - begin
+    third, fourth, fifth = 10 * away - 6 * velocity, -15 * away + 8 * velocity, 6 * away - 3 * velocity
+    return begin + share * (velocity + share**2 * (third + share * (fourth + share * fifth)))
+
+
+def _clear_ground(
+    height: Float[Tensor, " frames"], rest: Float[Tensor, " frames"], swing: Float[Tensor, " frames"]
+) -> Float[Tensor, " frames"]:
+    """Bring a toe's heights, metres, over the clearance of its swing, by a smooth maximum of both."""
+    window = torch.sin(math.pi * swing.clamp(0, 1)).square()
+    short = rest + _CLEARANCE * window - height
+    return height + 0.5 * (short + (short.square() + (0.5 * _CLEARANCE * window).square()).sqrt())

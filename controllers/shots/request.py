@@ -51,8 +51,8 @@ class Lead:
         if not 2 <= frame < canonical.num_frames:
             raise RequestError(f"the clip's frames to continue from are 2:{canonical.num_frames}, got {frame}")
         # Resampling keeps the first frame, so backwards it keeps the last.
-        backwards = _reverse(canonical.slice(0, frame + 1)).resample(PRIOR_FPS)
-        return Lead(_reverse(backwards.slice(0, min(backwards.num_frames, _MEMORY_FRAMES))))
+        backwards = canonical.slice(0, frame + 1).reverse().resample(PRIOR_FPS)
+        return Lead(backwards.slice(0, min(backwards.num_frames, _MEMORY_FRAMES)).reverse())
 
     @property
     def last_pose(self) -> Motion:
@@ -107,15 +107,6 @@ class Lead:
         observed = features.float()
         state = replay(prior, observed[1:], prior.start_after(observed[:1]))
         return start_from_state(state, GroundPose(ground[-1].float(), heading[-1].float()), character.unit_skeleton)
-
-
-def _reverse(motion: Motion) -> Motion:
-    return replace(
-        motion,
-        root_position=motion.root_position.flip(0),
-        local_quat_xyzw=motion.local_quat_xyzw.flip(0),
-        moving_offsets={joint: values.flip(0) for joint, values in motion.moving_offsets.items()},
-    )
 
 
 @dataclass(frozen=True, eq=False)

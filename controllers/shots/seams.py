@@ -14,7 +14,7 @@ from torch import Tensor
 
 from controllers.common.map_refinement import estimate_rest_height
 from controllers.inbetweening.pipeline import InfillSettings, fill
-from controllers.shots.footsteps import Displacement, Footstep, plan_footsteps, take_steps
+from controllers.shots.footsteps import Displacement, Footstep, LastSteps, plan_footsteps, take_steps
 from controllers.shots.request import Arrival, Lead
 from controllers.shots.trajectory import Span, Trajectory
 from controllers.shots.walk import Piece
@@ -32,6 +32,7 @@ _ACCELERATION_WEIGHT = 0.003  # m/s for a m/s^2 of the worst hand or toe
 _SKATE_WEIGHT = 0.5  # of skating toes beside sliding of the support
 _DETOUR_WEIGHT = 0.5  # of the trajectory's excess length over the straight one, m/s for m/s
 _UNSUPPORTED_WEIGHT = 0.5  # of the longest time on no planted foot, m/s for a second
+_TRIED_TRANSITIONS, _NEARLY = 12, 0.03  # transitions tried of those whose steps are strained least, or 3 cm more
 _SKATE_HEIGHT = 0.025  # metres
 _TOES = CANONICAL.indices(TOES)
 _EFFECTORS = CANONICAL.indices(("leftHand", "rightHand", *TOES))
@@ -126,14 +127,40 @@ _HASTY = 20  # frames of a transition for which there is no room
 _SETTLED = 8  # frames that are left of a walk between two transitions
 
 
-def join_pieces(
-    pieces: Sequence[Piece], trajectory: Trajectory, inbetweener: Inbetweener
-) -> tuple[Motion, Bool[Tensor, " frames"], list[Footstep]]:
-    """Join pieces: two stands by footsteps, others by the transitions that cost least. Also return the frames that the
-    in-betweener is to generate, and the footsteps."""
+@dataclass(frozen=True, eq=False)
+class JoinedPieces:
+    """Pieces joined to one motion, of which the in-betweener is to generate a part."""
+
+    motion: Motion
+    """All frames of the shot."""
+    missing: Bool[Tensor, " frames"]
+    """Frames that the in-betweener is to generate."""
+    footsteps: tuple[Footstep, ...]
+    """Steps between stands that no walk connects."""
+    first_steps: tuple[tuple[int, int], ...]
+    """Frames start to stop of transitions from a stand to a walk."""
+    last_steps: tuple[tuple[int, int], ...]
+    """Frames start to stop of transitions from a walk to a stand."""
+
+    def settle(self, motion: Motion) -> tuple[Motion, tuple[Footstep, ...]]:
+        """Let feet step where transitions have been generated: a foot stands while the other one swings. Also return
+        all footsteps."""
+        found, frames = [*self.footsteps], motion.num_frames
+        for start, stop in self.last_steps:
+            last = LastSteps(motion, start - 1, stop)
+            motion, found = _insert(motion, last.take(), start - 1), [*found, *last.plan()]
+        for start, stop in self.first_steps:  # backward in time a first step is a last one
+            last = LastSteps(motion.reverse(), frames - 1 - stop, frames - start)
+            motion = _insert(motion, last.take().reverse(), start - 1)
+            found += [step.reverse(frames) for step in last.plan()]
+        return motion, tuple(sorted(found, key=lambda step: step.lift))
+
+
+def join_pieces(pieces: Sequence[Piece], trajectory: Trajectory, inbetweener: Inbetweener) -> JoinedPieces:
+    """Join pieces: two stands by footsteps, others by the transitions that cost least."""
     joined, footsteps = pieces[0].motion, list[Footstep]()
     missing = torch.zeros(joined.num_frames, dtype=torch.bool)
-    earliest = 0
+    earliest, first_steps, last_steps = 0, list[tuple[int, int]](), list[tuple[int, int]]()
     for before, after in pairwise(pieces):
         if before.span.what == after.span.what == "stand":
             start, steps, plan = _step_across(before, after, trajectory, earliest)
@@ -142,15 +169,33 @@ def join_pieces(
             footsteps += plan
             earliest = stop
             continue
-        candidates = [
-            Filling.of_frames(_join_across(joined, after.motion, start), start, stop)
-            for start, stop in _lay_transitions(before.span, after.span, joined.num_frames, earliest)
-        ]
+        stops = after.span.what == "stand"
+        candidates = _keep_comfortable(
+            [
+                Filling.of_frames(_join_across(joined, after.motion, start), start, stop)
+                for start, stop in _lay_transitions(before.span, after.span, joined.num_frames, earliest)
+            ],
+            stops=stops,
+        )
         chosen = candidates[choose_filling(candidates, inbetweener)]
         joined, (start, stop) = chosen.motion, chosen.around
         missing[start:stop] = True
+        if before.span.what != after.span.what:
+            (last_steps if stops else first_steps).append((start, stop))
         earliest = stop + _SETTLED
-    return joined, missing, footsteps
+    return JoinedPieces(joined, missing, tuple(footsteps), tuple(first_steps), tuple(last_steps))
+
+
+def _keep_comfortable(candidates: Sequence[Filling], *, stops: bool) -> list[Filling]:
+    """Return the transitions between walk and stand whose steps are the least strained, or nearly."""
+    strains = []
+    for candidate in candidates:
+        (start, stop), motion = candidate.around, candidate.motion
+        if not stops:
+            motion, start, stop = motion.reverse(), motion.num_frames - stop, motion.num_frames + 1 - start
+        strains.append(LastSteps(motion, start - 1, stop).measure_strain())
+    order = sorted(range(len(strains)), key=lambda at: strains[at])
+    return [candidates[at] for at in order[:_TRIED_TRANSITIONS] if strains[at] <= strains[order[0]] + _NEARLY]
 
 
 def _step_across(
@@ -179,12 +224,12 @@ def _lay_transitions(before: Span, after: Span, frames: int, earliest: int) -> l
     if after.what == "stand" and after.stop == frames:
         latest, hasty = min(latest, frames - _STILL_END), min(hasty, frames - _STILL_END)
     if before.what == "walk":
-        grid = product((-12, -8, -4, 0, 4, 8), (26, 34))
+        grid = product(range(-20, 9, 2), (26, 34))
         tried = [(before.stop + step, before.stop + step + length) for step, length in grid]
     else:
         # From standing to walking one may begin at once; from a stand to the next there may be more than a step.
         longest = after.start - (first if after.what == "walk" else before.stop)
-        grid = product((0, 4, 8, 12, 16), sorted({18, 26, longest}))
+        grid = product(range(0, 17, 2), sorted({18, 26, longest}))
         tried = [(after.start + step - length, after.start + step) for step, length in grid]
     found = [(start, stop) for start, stop in tried if first <= start and stop <= latest and stop - start >= _SHORTEST]
     start = max(earliest, min(before.stop - 1, hasty - _HASTY))

@@ -31,7 +31,16 @@ from controllers.shots.reaching import (
     turn_heads,
 )
 from controllers.shots.request import Reach, ShotRequest
-from controllers.shots.seams import OVERLAP, arrive, close_loop, fill_frames, go_on, join_pieces, repair_jumps
+from controllers.shots.seams import (
+    OVERLAP,
+    JoinedPieces,
+    arrive,
+    close_loop,
+    fill_frames,
+    go_on,
+    join_pieces,
+    repair_jumps,
+)
 from controllers.shots.trajectory import Trajectory, plan_trajectory
 from controllers.shots.walk import FollowSettings, check_path, check_tracking, slows_in_corners, walk_spans
 from mapctl.curves import Curve
@@ -115,10 +124,10 @@ def solve_shot(
         progress=progress,
         deadline=None if deadline_seconds is None else time.monotonic() + deadline_seconds,
     )
-    motion, reaches, met, footsteps = pieces[0].motion, request.reaches, (), []
+    motion, reaches, met, footsteps = pieces[0].motion, request.reaches, (), ()
     if inbetweener is not None:
-        motion, missing, footsteps = join_pieces(pieces, trajectory, inbetweener)
-        motion = _finish_ends(motion, missing, request, trajectory, inbetweener)
+        joined = join_pieces(pieces, trajectory, inbetweener)
+        motion, footsteps = _finish_ends(joined, request, trajectory, inbetweener)
         motion, reaches, met = _meet_keys(motion, request, trajectory, inbetweener)
     notes = [trajectory.note] if trajectory.note else []
     if request.walks_only:
@@ -139,26 +148,28 @@ def solve_shot(
         constraints=constraints,
         reaches=reaches,
         met=met,
-        footsteps=tuple(footsteps),
+        footsteps=footsteps,
     )
 
 
 def _finish_ends(
-    motion: Motion, missing: torch.Tensor, request: ShotRequest, trajectory: Trajectory, inbetweener: Inbetweener
-) -> Motion:
-    """Generate the missing frames, and let the motion continue from, end in, or come round to what is requested."""
-    past = None
+    joined: JoinedPieces, request: ShotRequest, trajectory: Trajectory, inbetweener: Inbetweener
+) -> tuple[Motion, tuple[Footstep, ...]]:
+    """Generate the missing frames, and let the motion continue from, end in, or come round to what is requested. Also
+    return the footsteps beside stands."""
+    motion, missing, past = joined.motion, joined.missing, None
     if request.lead is not None:
         motion, past = go_on(motion, missing, request.lead, inbetweener), request.lead.past
     elif bool(missing.any()):
         motion = fill_frames(motion, missing, inbetweener)
+    motion, footsteps = joined.settle(motion)
     motion = repair_jumps(motion, inbetweener, past=past)
     if request.loop:
         motion = close_loop(motion, len(trajectory.speeds), inbetweener)
     if request.arrival is not None:
         arrival = request.arrival.bring_to(trajectory.curve, float(trajectory.arcs[-1]))
         motion = arrive(motion, arrival, inbetweener)
-    return motion
+    return motion, footsteps
 
 
 def _meet_keys(
