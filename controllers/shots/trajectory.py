@@ -15,7 +15,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from controllers.shots.request import Others, ShotRequest
-from mapctl import curves
+from mapctl import curves, rotations
 from mapctl.curves import Curve
 from mapctl.curves.obstacles import measure_clearance
 from mapctl.errors import RequestError
@@ -127,6 +127,25 @@ class Span:
     """First frame."""
     stop: int
     """One past the last frame."""
+    facing: float = 0.0
+    """Metres along the curve, from where it stands, at which the curve leads where the character faces."""
+
+
+def split_turns(spans: Sequence[Span], trajectory: "Trajectory") -> list[Span]:
+    """Split a stand where the curve reverses: one before and one after, between which the character turns."""
+    found = list[Span]()
+    for span in spans:
+        arc = trajectory.arcs[[span.start]]
+        before, after = (trajectory.curve.heading(arc + side * _CORNER) for side in (-1.0, 1.0))
+        turned = abs(float(rotations.wrap_angle(after - before)))
+        within = span.start > 0 and span.stop < len(trajectory.arcs)
+        if span.what == "walk" or not within or turned < _REVERSAL:
+            found.append(span)
+            continue
+        held = max(1, (span.stop - span.start - round(_TURN_SECONDS * PRIOR_FPS)) // 2)
+        found.append(Span("stand", span.start, span.start + held, -_CORNER))
+        found.append(Span("stand", span.stop - held, span.stop, _CORNER))
+    return found
 
 
 def lay_timeline(speeds: Float[Tensor, " frames"], *, slowest: float) -> list[Span]:
@@ -212,7 +231,8 @@ def plan_speeds(
 _BODY_MARGIN = 0.35  # metres from the hips to an obstacle's edge: arms swing that far
 APART_MARGIN = 0.15
 """Metres beyond the distance to others by which trajectories keep apart: hips sway, and are early or late."""
-_TURN_SECONDS = 0.6  # of standing where a curve reverses
+_TURN_SECONDS, _TURN_HELD = 1.8, 0.2  # of steps where a curve reverses, and of standing before them and after
+_CORNER, _REVERSAL = 0.04, math.radians(60.0)  # metres beside a corner where its directions are, and their difference
 _FINE_STEP = 0.02  # metres of arc
 _CATCH_UP = 3.0  # metres of arc over which a longer trajectory is caught up
 _MOST_FRAMES = 108_000
@@ -333,7 +353,7 @@ def _plan_reversals(
     """Plan speeds along a curve that reverses: to a stand at each reversal, and on from there."""
     stops, speeds = [0.0, *reversals, curve.length], []
     for number, (start, stop) in enumerate(pairwise(stops)):
-        piece, turning = ends, _TURN_SECONDS / 2
+        piece, turning = ends, _TURN_SECONDS / 2 + _TURN_HELD
         if number > 0:
             piece = replace(piece, start=True, still=turning)
         if number < len(reversals):

@@ -12,7 +12,7 @@ from torch import Tensor
 from controllers.common.character import Character
 from controllers.common.initial_state import MotionStart, select_initial_state
 from controllers.shots.request import ShotRequest
-from controllers.shots.trajectory import Span, Trajectory, cut_curve, lay_timeline
+from controllers.shots.trajectory import Span, Trajectory, cut_curve, lay_timeline, split_turns
 from mapctl.curves import Curve
 from mapctl.curves.tracking import track_arcs
 from mapctl.errors import MapctlError
@@ -179,7 +179,10 @@ def walk_spans(
             found.append(KeepApart(hips, request.others.distance + 0.05))
         return found
 
-    for span in [Span("walk", 0, frames)] if walks_only else lay_timeline(trajectory.speeds, slowest=slowest):
+    spans = [Span("walk", 0, frames)]
+    if not walks_only:
+        spans = split_turns(lay_timeline(trajectory.speeds, slowest=slowest), trajectory)
+    for span in spans:
         lead = request.lead if span.start == 0 else None
         if span.what == "stand":
             standing = _stand(rest, trajectory, span) if lead is None else lead.last_pose
@@ -251,7 +254,8 @@ def _extend(arcs: Float[Tensor, " frames"], more: int) -> Float[Tensor, " ahead"
 def _stand(rest: Motion, trajectory: Trajectory, span: Span) -> Motion:
     """Stand on the trajectory during a span, facing along it."""
     arc = trajectory.arcs[span.start]
-    return move_to(rotate_about_vertical(rest, trajectory.curve.heading(arc)), trajectory.curve.ground_point(arc))
+    heading = trajectory.curve.heading(arc + span.facing)
+    return move_to(rotate_about_vertical(rest, heading), trajectory.curve.ground_point(arc))
 
 
 def _spread_over(motion: Motion, start: int, frames: int) -> Motion:
