@@ -45,6 +45,19 @@ def turn_rate(angle: Float[Tensor, "frames"], fps: float) -> float:
     return float(low_pass(angle, seconds=TURN_SECONDS, fps=fps).diff().abs().mean() * fps)
 
 
+def measure_glide(feet: Float[Tensor, "frames 4 3"], fps: float) -> float:
+    """Measure the longest travel without a step, metres: over the ground, of the slowest of toes and ankles (in this
+    order), while all of them are faster than 20 cm/s and a toe is within 3 cm of its lowest height.
+
+    Captured walks and turns have 0.8 cm (median) and 3.4 at most, runs 6.5 and 12.9, which fly.
+    """
+    slowest = (feet[..., ::2].diff(dim=0).norm(dim=-1) * fps).amin(dim=1)
+    toes = feet[:, :2, 1]
+    gliding = (slowest > _GLIDE_SPEED) & ((toes - toes.amin(dim=0))[1:] < _GLIDE_HEIGHT).any(dim=1)
+    travels = [float(slowest[start:stop].sum()) / fps for _, start, stop in true_intervals(gliding[:, None])]
+    return max(travels, default=0.0)
+
+
 def pose_variation(
     positions: Float[Tensor, "frames joints 3"], hips: Float[Tensor, "frames 3"], angle: Float[Tensor, "frames"]
 ) -> float:
@@ -57,6 +70,7 @@ def pose_variation(
     return float(relative.movedim(-1, 0).std(dim=1, correction=0).mean())
 
 
+_GLIDE_SPEED, _GLIDE_HEIGHT = 0.2, 0.03  # m/s and metres
 _NEAR_FLOOR = 0.05  # height of the lower toe over its floor, metres, above which the body flies
 _LOW, _SLOW = 0.03, 0.35  # limits of a supporting toe's height, metres, and speed, m/s
 _MOVING_SPEED = 0.3  # speed of moving hips, m/s

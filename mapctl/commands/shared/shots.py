@@ -237,8 +237,14 @@ class PlayedShot:
             f"progress  {m['travelled_m']} of {m['wanted_m']} m",
             f"feet      planted {planted:.0%} of the time, then moving {m['contact_speed_cm_s']} cm/s",
             *constraints,
-            f"cost      {cost['frame_ms_p50']:.1f} ms a frame (p99 {cost['frame_ms_p99']:.1f}), "
-            f"{cost['evaluations_per_frame']:.1f} evaluations a frame, threads: {cost['threads']}",
+            *(
+                [
+                    f"cost      {cost['frame_ms_p50']:.1f} ms a frame (p99 {cost['frame_ms_p99']:.1f}), "
+                    f"{cost['evaluations_per_frame']:.1f} evaluations a frame, threads: {cost['threads']}"
+                ]
+                if self.solution.windows
+                else []
+            ),
             f"status    {self.solution.status.text}",
         ]
 

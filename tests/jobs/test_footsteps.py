@@ -1,0 +1,108 @@
+"""Footsteps: a foot stands while the other swings, at planned footholds; displacements without steps are named."""
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+import torch
+
+import priors
+from controllers.shots.constraints import check_constraints
+from controllers.shots.footsteps import Displacement, LastSteps, plan_footsteps, take_steps
+from controllers.shots.reaching import build_rest_pose
+from controllers.shots.request import ShotRequest
+from controllers.shots.trajectory import plan_trajectory
+from mapctl import curves
+from mapctl.kinematics.moving import move_to, rotate_about_vertical
+from mapctl.metrics.body import measure_glide
+from mapctl.skeleton import CANONICAL, FEET, TOES
+
+FOUR = [*CANONICAL.indices(TOES), *CANONICAL.indices(FEET)]
+CASES = {
+    "20 cm": (0.0, 0.2, 0.0),
+    "70 cm": (0.0, 0.7, 0.0),
+    "2 m": (0.0, 2.0, 0.0),
+    "aside": (0.4, 0.0, 0.0),
+    "back": (0.0, -0.5, 0.0),
+    "a quarter turn": (0.0, 0.0, math.pi / 2),
+    "about": (0.0, 0.0, -math.pi),
+}
+
+
+@pytest.fixture(scope="module")
+def rest(prior):
+    return build_rest_pose(priors.load(prior), CANONICAL, 0.0425)
+
+
+def displace(rest, x, z, turn):
+    stop = move_to(rotate_about_vertical(rest, turn), torch.tensor([x, z], dtype=torch.float64))
+    share = torch.linspace(0, 1, 30, dtype=torch.float64)
+    return Displacement(rest, stop, torch.stack([x * share, z * share, turn * share], dim=-1))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_foot_stands_while_the_other_swings(rest, case):
+    displacement = displace(rest, *CASES[case])
+    frames = displacement.count_frames()
+    plan = plan_footsteps(displacement, frames)
+    motion = take_steps(displacement, plan, frames)
+    positions = motion.joint_positions()
+    ends = [displacement.start.joint_positions(), displacement.stop.joint_positions()]
+    torch.testing.assert_close(positions[[0, -1]], torch.cat(ends))
+    assert [step.foot for step in plan[1:]] == [1 - step.foot for step in plan[:-1]]
+    assert all(one.land < other.lift for one, other in pairwise(plan))
+    toes = positions[:, FOUR[:2]]
+    for foot in range(2):
+        steps = [step for step in plan if step.foot == foot]
+        for step in steps:
+            assert toes[step.land, foot, ::2].tolist() == pytest.approx(step.toe, abs=1e-6)
+        swings = torch.zeros(frames - 1, dtype=torch.bool)
+        for step in steps:
+            swings[step.lift : step.land] = True
+        assert float(torch.diff(toes[:, foot, ::2], dim=0).norm(dim=-1)[~swings].max()) < 1e-6
+    assert float(toes[..., 1].min()) > 0.0425 - 1e-3
+    assert float(positions.diff(n=2, dim=0).norm(dim=-1).max()) * 900 < 45
+    assert measure_glide(positions[:, FOUR], 30.0) == 0.0
+
+
+def test_a_body_that_stays_takes_no_step(rest):
+    assert plan_footsteps(displace(rest, 0.0, 0.01, 0.0), 30) == []
+
+
+def test_a_step_to_the_side_begins_with_the_foot_of_that_side(rest):
+    for x, foot in ((0.4, 0), (-0.4, 1)):  # left is +x
+        assert plan_footsteps(displace(rest, x, 0.0, 0.0), 39)[0].foot == foot
+
+
+def test_there_is_a_step_at_least_every_second_and_a_half(rest):
+    plan = plan_footsteps(displace(rest, 0.0, 0.5, 0.0), 300)
+    assert max(step.land - step.lift for step in plan) <= 45
+
+
+def test_last_steps_land_on_the_footholds_of_the_stand(rest):
+    plan = plan_footsteps(displace(rest, 0.0, 1.2, 0.0), 73)
+    steps = take_steps(displace(rest, 0.0, 1.2, 0.0), plan, 73)
+    walked = steps.join(steps.slice(72, 73)).join(steps.slice(72, 73))
+    start = (plan[-2].lift + plan[-2].land) // 2
+    root, quats = walked.root_position.clone(), walked.local_quat_xyzw.clone()
+    quats[start + 1 : 72] = quats[72]  # legs that do not step between
+    last = LastSteps(replace(walked, root_position=root, local_quat_xyzw=quats), start, 72)
+    motion = last.take()
+    toes = motion.joint_positions()[:, FOUR[:2]]
+    torch.testing.assert_close(toes[-1], steps.joint_positions()[-1, FOUR[:2]])
+    assert [step.foot for step in last.plan()] == [plan[-2].foot, plan[-1].foot]
+    assert measure_glide(motion.joint_positions()[:, FOUR], 30.0) == 0.0
+
+
+def test_a_displacement_without_steps_does_not_hold(rest):
+    curve = curves.line(length=0.7)
+    trajectory = plan_trajectory(request := ShotRequest(curve, stand_at_start=True, stand_at_end=True))
+    frames = len(trajectory.arcs)
+    root = rest.root_position.expand(frames, 3).clone()
+    root[:, 2] += trajectory.arcs
+    slid = replace(rest, root_position=root, local_quat_xyzw=rest.local_quat_xyzw.expand(frames, -1, 4))
+    found = {one.name: one for one in check_constraints(request, trajectory, slid)}
+    assert not found["feet"].holds
+    assert found["feet"].got > 40
+    assert found["acceleration"].holds
