@@ -147,7 +147,8 @@ class ReachTargets:
 
 
 def settle_reaches(reaches: Sequence[Reach], motion: Motion) -> tuple[Reach, ...]:
-    """Return reaches at the times, within the frames that each allows, at which their limbs are nearest to there."""
+    """Return reaches at the times, within the frames that each allows, at which their limbs are nearest to there, and
+    are not stretched while they are held."""
     positions, found = motion.joint_positions(), []
     for reach in reaches:
         if not reach.within_frames:
@@ -158,11 +159,18 @@ def settle_reaches(reaches: Sequence[Reach], motion: Motion) -> tuple[Reach, ...
         last = min(motion.num_frames - 1 - hold, at + reach.within_frames)
         limbs = [CANONICAL.index(name) for name in reach.positions]
         away = (positions[:, limbs] - positions.new_tensor(list(reach.positions.values()))).norm(dim=-1).sum(dim=-1)
-        best = first + int(away[first : max(first, last) + 1].argmin())
+        stretched = torch.zeros_like(away)
+        for name, position in reach.positions.items():
+            limb = LIMBS[name]
+            far = (positions[:, limb.upper] - positions.new_tensor(position)).norm(dim=-1)
+            stretched += (far - EASY_SHARE * limb.length(motion.skeleton)).clamp_min(0)
+        held = torch.stack([stretched.roll(-frame) for frame in range(hold + 1)]).amax(dim=0)
+        best = first + int((away + _STRETCH_WEIGHT * held)[first : max(first, last) + 1].argmin())
         found.append(replace(reach, seconds=best / PRIOR_FPS))
     return tuple(found)
 
 
+_STRETCH_WEIGHT = 10.0  # metres that a hand goes for a metre by which it is stretched
 _TIPTOE, _CROUCH = 0.15, 1.0  # metres by which a body rises or goes down for a reach
 _STEP_ASIDE = 1.2  # metres between the trajectory and a body that leans and leaves it for a reach
 _BEND_LENGTH, _BEND_STEP = 1.2, 0.05  # metres of arc over which it bends toward a reach, and between its offsets
