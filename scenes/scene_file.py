@@ -53,6 +53,9 @@ class ShotOptions:
     """How it ends: in its stride, standing, or in a frame of a motion file."""
     loop: bool = False
     """The last frame leads into the first: once around a closed curve."""
+    smooth: Annotated[float | None, Field(ge=0, le=10), arg(metavar="METRES")] = None
+    """Metres of arc over which the curve is smoothed; 0 for none. If not given, paths that jitter are smoothed over
+    0.2."""
 
 
 @dataclass(frozen=True, kw_only=True)

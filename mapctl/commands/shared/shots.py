@@ -24,6 +24,7 @@ from mapctl.commands.shared.options import ReadOptions
 from mapctl.commands.shared.outputs import add_licence
 from mapctl.curves import Curve
 from mapctl.curves.obstacles import Obstacle
+from mapctl.curves.smoothing import smooth_path
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.path import SpeedProfile, TimedSpeed
@@ -55,6 +56,8 @@ class ShotPlan:
     """Its body."""
     fps: Fraction
     """Rate of its motion."""
+    note: str | None = None
+    """Changes to its curve."""
 
 
 def plan_shot(
@@ -96,6 +99,7 @@ def plan_shot(
                 raise RequestError(f"{name}: {error}") from error
         return clips[name]
 
+    curve, note = smooth_path(curve, actor.smooth)
     placed, lead, arrival = actor.offset is not None or actor.turn_deg is not None, None, None
     if actor.start_clip is not None:
         lead = Lead.of(read(actor.start_clip[0]), actor.start_clip[1])
@@ -132,7 +136,7 @@ def plan_shot(
         obstacles=tuple(obstacles),
     )
     labels = [f"{group}={value}" for group, value in (("gait", actor.gait), ("style", actor.style)) if value]
-    return ShotPlan(actor, request, prior.conditioned_on(labels) if labels else prior, character, rate)
+    return ShotPlan(actor, request, prior.conditioned_on(labels) if labels else prior, character, rate, note)
 
 
 def _read_speed(actor: Actor, curve: Curve) -> SpeedProfile | TimedSpeed | None:
@@ -272,7 +276,8 @@ def play_shot(
         skeleton=plan.character.skeleton,
         progress=progress,
     )
-    return PlayedShot(plan, solution)
+    notes = () if plan.note is None else (plan.note,)
+    return PlayedShot(plan, replace(solution, status=solution.status.with_notes(notes)))
 
 
 def let_others_pass(plans: Sequence[ShotPlan], keep_apart: float) -> list[ShotPlan]:
