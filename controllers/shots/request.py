@@ -34,6 +34,7 @@ _ASIDE = math.radians(75.0)  # between the hips' heading and the direction of tr
 _STILL_SPEED = 0.3  # m/s of a joint, above which it gestures
 _PAST_FRAMES = 10  # of a clip, before a shot's first frame
 _SAME_POSITION = 0.05  # metres
+_LOWEST_HIPS, _MOST_RISE = 0.3, 0.4  # metres of a curve in space: of a child's hips, and from a crouch to a stand
 _APART_SECONDS = 2 / PRIOR_FPS  # between keys that are to differ
 
 
@@ -319,6 +320,13 @@ class ShotRequest:
         }
         if fault := next((what for what, holds in faults.items() if holds), None):
             raise RequestError(fault)
+        if self.curve.dims == 3:
+            lowest, highest = (float(height) for height in self.curve.points[:, 1].aminmax())
+            if lowest < _LOWEST_HIPS or highest - lowest > _MOST_RISE:
+                raise RequestError(
+                    f"the curve's heights, {lowest:.2f} to {highest:.2f} m, are not those of walking hips, and the "
+                    "ground is level: give x,z"
+                )
         for key in (*self.reaches, *self.looks, *self.poses):
             if self.seconds is not None and not 0 <= key.seconds <= self.seconds - key.hold_seconds:
                 raise RequestError(

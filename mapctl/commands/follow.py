@@ -26,7 +26,8 @@ class FollowCurve(ModelCommand, options.ReadOptions, ShotOptions):
     """A character walks a curve: BVH and, if requested, a film and a report."""
 
     curve: Positional[options.CurveText]
-    """circle:4, figure8:2, s:6, line:10, wave:1x8 (metres), a CSV file of x,z or x,y,z, or an SVG file."""
+    """circle:4, figure8:2, s:6, line:10, wave:1x8 (metres), a CSV file of x,z or, with heights of the hips,
+    x,y,z, or an SVG file."""
     out: options.OutFile
     """Output file: .bvh, .npz, .glb or .usda."""
     speed: options.MaybeSpeed = None

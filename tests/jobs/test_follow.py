@@ -55,6 +55,12 @@ def test_a_walk_starts_on_the_curves_first_point_going_along_it(curve):
     torch.testing.assert_close(encode(motion)[0][1:, :66], solution.features[1:, :66].double(), atol=1e-5, rtol=0)
 
 
+def test_a_curve_that_rises_is_refused():
+    hills = curves.from_points(HILL - HILL.new_tensor([0.0, 0.9, 0.0]))
+    with pytest.raises(RequestError, match="the ground is level: give x,z"):
+        follow(hills)
+
+
 def test_the_same_seed_gives_the_same_bytes_and_other_seeds_other_walks(tmp_path):
     curve = curves.circle(radius=2)
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
