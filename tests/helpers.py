@@ -275,3 +275,23 @@ def killing(settings: type, number: int) -> Iterator[None]:
         patch.setattr(settings, "make_trainer", make_stopping)
         with pytest.raises(Killed):
             yield
+
+
+KEYS = """
+body = "in.bvh"
+[[key]]
+frame = 0
+[[key]]
+seconds = 0.5
+reach = { Hand_L = [0.4, 1.2, 0.8] }
+[[key]]
+frame = 22
+pose = "other.bvh"
+pose_frame = 20
+root_only = true
+[[key]]
+frame = 40
+pose_frame = 40
+place = [0.3, 1.5]
+"""
+"""Keys of every kind for `tween`, on the rig of in.bvh."""

@@ -23,7 +23,7 @@ from mapctl.skeleton import CANONICAL, FEET, LIMBS, TOES
 _PATH_CM, _PROGRESS_CM, _REACH_CM, _POSE_CM = 15.0, 50.0, 1.0, 0.1
 _FACING_DEG, _LOOK_DEG, _STILL_CM_S = 0.1, 15.0, 6.0
 _GLIDE_CM, _GLIDE_RUNNING_CM, _RUNNING = 4.0, 15.0, 2.0  # of a walk, and from this speed on, m/s
-_ACCELERATION = 90.0  # m/s^2 of any joint at PRIOR_FPS: the most in 160 captured walks, runs and gestures
+_ACCELERATION = 90.0  # m/s^2 of any joint at PRIOR_FPS: captured walks, runs and gestures stay below
 _SEAM_RATIO = 1.2  # of a loop's largest step from one frame to the next
 _NEAR_KEY_SECONDS = 1.0
 _ASIDE = 0.05  # metres beside the curve, from which on a trajectory is bent toward a reach

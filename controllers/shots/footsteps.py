@@ -263,18 +263,24 @@ def _stand_on(motion: Motion, toes: Float[Tensor, "frames 2 3"], turns: Float[Te
     lower = _smooth_between(lower)
     root = motion.root_position - torch.stack([0 * lower, lower, 0 * lower], dim=-1)
     motion = replace(motion, root_position=root)
-    positions, world = motion.joint_positions(), motion.joint_rotations()
-    quats = motion.local_quat_xyzw.clone()
-    for foot, limb in enumerate(_LEGS):
-        aim = ankles[foot] - positions[:, limb.upper]
-        turn, bent = inverse.reach(limb, world[:, limb.upper], quats[:, limb.lower], aim, skeleton.offsets.to(toes))
-        quats[:, limb.upper] = rotations.multiply(rotations.inverse(world[:, 0]), turn)
-        quats[:, limb.lower] = bent
-        quats[:, limb.end] = rotations.multiply(rotations.inverse(rotations.multiply(turn, bent)), turns[:, foot])
+    quats = bend_legs(motion, torch.stack(ankles, dim=1), turns).local_quat_xyzw
     return replace(motion, local_quat_xyzw=rotations.make_sign_continuous(quats))
 
 
-_FASTEST_LANDING, _SETTLE = 7, 13  # frames of a swing that is under way already, at least; of one from the ground
+def bend_legs(motion: Motion, ankles: Float[Tensor, "frames 2 3"], turns: Float[Tensor, "frames 2 4"]) -> Motion:
+    """Bend legs so that ankles are at positions, metres, and feet have these rotations, world; thighs turn as little as
+    it takes."""
+    positions, world, quats = motion.joint_positions(), motion.joint_rotations(), motion.local_quat_xyzw.clone()
+    for foot, limb in enumerate(_LEGS):
+        aim, offsets = ankles[:, foot] - positions[:, limb.upper], motion.skeleton.offsets.to(positions)
+        turn, bent = inverse.reach(limb, world[:, limb.upper], quats[:, limb.lower], aim, offsets)
+        quats[:, limb.upper] = rotations.multiply(rotations.inverse(world[:, 0]), turn)
+        quats[:, limb.lower] = bent
+        quats[:, limb.end] = rotations.multiply(rotations.inverse(rotations.multiply(turn, bent)), turns[:, foot])
+    return replace(motion, local_quat_xyzw=quats)
+
+
+_FASTEST_LANDING = 7  # frames that a swing under way still takes at least
 _AIRBORNE = 0.5  # m/s of a toe, from which on it is in its swing
 _AHEAD = 1.9  # times that a swing under way takes longer than at its speed, so that it ends at rest
 
@@ -295,12 +301,12 @@ class LastSteps:
         toes, speeds = self._toes, self._velocities.norm(dim=-1)
         away = (toes[self.stop] - toes[self.start]).norm(dim=-1)
         first = int(speeds.argmax()) if float(speeds.max()) > _AIRBORNE else int(away.argmax())
-        swing = _SETTLE
+        swing = _SWING
         if float(speeds[first]) > _AIRBORNE:
             swing = round(_AHEAD * float(away[first] / speeds[first]) * PRIOR_FPS)
-            swing = max(_FASTEST_LANDING, min(_SETTLE, swing))
+            swing = max(_FASTEST_LANDING, min(_SWING, swing))
         landed = min(self.start + swing, self.stop - 2)
-        last = min(self.stop, landed + 1 + max(_SETTLE, 2))
+        last = min(self.stop, landed + 1 + _SWING)
         steps = [Footstep(first, self.start, landed, 1.0), Footstep(1 - first, landed + 1, last, 1.0)]
         ground = toes[self.stop][:, ::2].tolist()
         return [replace(step, toe=tuple(ground[step.foot])) for step in steps if float(away[step.foot]) > _MOVED]

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controllers.inbetweening.pipeline import fill
+from controllers.shots.footsteps import bend_legs
 from controllers.shots.request import Look, PoseKey, Reach, ShotRequest
 from controllers.shots.seams import Filling, choose_filling
 from controllers.shots.trajectory import Trajectory, bend_trajectory
@@ -22,7 +23,6 @@ from mapctl.features import PRIOR_FPS, GroundPose
 from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.inbetweening.partial_motion import mirror_quats
-from mapctl.kinematics import inverse
 from mapctl.kinematics.inverse import bend_within, find_out, lead_about
 from mapctl.kinematics.moving import measure_look_angle, turn_head
 from mapctl.motion import Motion
@@ -30,7 +30,7 @@ from mapctl.numerics.easing import smootherstep
 from mapctl.numerics.intervals import true_intervals, widen
 from mapctl.pose import decode
 from mapctl.protocols import Density, Inbetweener
-from mapctl.skeleton import CANONICAL, LIMBS, TOES, Skeleton
+from mapctl.skeleton import CANONICAL, FEET, LIMBS, TOES, Skeleton
 from mapctl.terms.keep_clear import WithinReach
 
 AROUND_FRAMES = 27
@@ -263,7 +263,8 @@ def go_down(motion: Motion, reaches: Sequence[Reach], posed: Bool[Tensor, " fram
     if not bool((down > 0).any()):
         return motion
     lowered = replace(motion, root_position=motion.root_position - down[:, None] * down.new_tensor([0.0, 1.0, 0.0]))
-    return _keep_feet(lowered, motion)
+    feet = list(CANONICAL.indices(FEET))
+    return bend_legs(lowered, motion.joint_positions()[:, feet], motion.joint_rotations()[:, feet])
 
 
 def _find_lacking_below(motion: Motion, reach: Reach, frame: int) -> float:
@@ -278,23 +279,6 @@ def _find_lacking_below(motion: Motion, reach: Reach, frame: int) -> float:
         room = (EASY_SHARE * bones) ** 2 - float(away[::2].square().sum())
         lacking = max(lacking, float(away[1]) - math.sqrt(max(room, (_STRAIGHT_AHEAD * bones) ** 2)))
     return lacking
-
-
-def _keep_feet(motion: Motion, before: Motion) -> Motion:
-    """Bend legs so that feet are where they were before, and turned as they were; thighs turn as little as it takes."""
-    quats = motion.local_quat_xyzw.clone()
-    goals, world, feet = motion.joint_positions(), motion.joint_rotations(), before.joint_positions()
-    for name, limb in LIMBS.items():
-        if name.endswith("Foot"):
-            aim = feet[:, limb.end] - goals[:, limb.upper]
-            offsets = motion.skeleton.offsets.to(aim)
-            turned, bent = inverse.reach(limb, world[:, limb.upper], quats[:, limb.lower], aim, offsets)
-            above = world[:, CANONICAL.parents[limb.upper]]
-            quats[:, limb.upper] = rotations.multiply(rotations.inverse(above), turned)
-            quats[:, limb.lower] = bent
-            shin = rotations.multiply(turned, bent)
-            quats[:, limb.end] = rotations.multiply(rotations.inverse(shin), world[:, limb.end])
-    return replace(motion, local_quat_xyzw=quats)
 
 
 _WIDTHS = (10, 16, 24, 36)  # frames on either side of a key that are tried

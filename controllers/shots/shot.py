@@ -68,7 +68,7 @@ class ShotSolution(Solution):
     """Keys of poses, positions and facings, as they were met."""
 
     footsteps: tuple[Footstep, ...] = ()
-    """Steps between stands that no walk connects, in frames of the motion."""
+    """Steps from one stand to the next, and the first and last ones beside a stand, in frames of the motion."""
 
     def details(self) -> dict:
         """Return the constraints and the footsteps."""

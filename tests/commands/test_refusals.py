@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from acclaim import pair
 from captures import on_rig
-from helpers import run, walk
+from helpers import KEYS, run, walk
 from strange_rigs import CASES as STRANGE_RIGS
 from tiny_denoiser import save_tiny_denoiser
 from tiny_infiller import save_tiny_infiller
@@ -43,23 +43,6 @@ MOTIONS = {
 }
 CURVES = {"cut": "x,z\n0,0\n1,", "nan": "x,z\n0,0\n1,nan\n", "counts": "x,z\n0,0\n1,1,1,1\n", "point": "x,z\n0,0\n"}
 MASKS = {"wrong": "Hand_L,4,x", "name": "Hnad_L,4,6", "late": "Hand_L,4,50"}
-KEYS = """
-body = "in.bvh"
-[[key]]
-frame = 0
-[[key]]
-seconds = 0.5
-reach = { Hand_L = [0.4, 1.2, 0.8] }
-[[key]]
-frame = 22
-pose = "other.bvh"
-pose_frame = 20
-root_only = true
-[[key]]
-frame = 40
-pose_frame = 40
-place = [0.3, 1.5]
-"""
 PARTS = """
 body = "in.bvh"
 [[key]]

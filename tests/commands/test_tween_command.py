@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from captures import on_rig
-from helpers import run, walk
+from helpers import KEYS, run, walk
 from methods import words_of
 from tiny_infiller import save_tiny_infiller
 from tiny_path import save_tiny_path
@@ -114,24 +114,7 @@ def test_a_report_lists_every_key_with_its_residual(tween, source, tmp_path, wor
 
 
 DOCS = Path(__file__).parents[2] / "docs" / "inputs"
-GOOD = """
-body = "walk.bvh"
-[[key]]
-frame = 0
-[[key]]
-seconds = 0.5
-reach = { Hand_L = [0.4, 1.2, 0.8] }
-[[key]]
-frame = 22
-pose = "other.bvh"
-pose_frame = 20
-root_only = true
-[[key]]
-frame = 40
-pose_frame = 40
-place = [0.3, 1.5]
-facing_deg = 30
-"""
+GOOD = KEYS.replace("in.bvh", "walk.bvh") + "facing_deg = 30\n"
 
 
 @pytest.fixture
