@@ -71,6 +71,7 @@ _MASK = torch.arange(FRAMES)[:, None] % (2 + torch.arange(21)) != 1
 TERMS: dict[str, Term] = {
     "likelihood": Likelihood(temperature=2.0),
     "noise": LatentPrior(sigma=0.7),
+    "noise about a draw": LatentPrior(0.7, torch.randn(FRAMES, LAYOUT.continuous, generator=generator(5))),
     "path of the hips": Path(curves.line(length=3), _ARCS),
     "path of a hand": Path(curves.circle(radius=3), _ARCS, joint="leftHand"),
     "path in space": Path(_IN_SPACE, _ARCS, joint="rightToes"),

@@ -16,7 +16,7 @@ from controllers.shots.trajectory import Span, Trajectory, cut_curve, lay_timeli
 from mapctl.curves import Curve
 from mapctl.curves.tracking import track_arcs
 from mapctl.errors import MapctlError
-from mapctl.features import PRIOR_FPS
+from mapctl.features import LAYOUT, PRIOR_FPS
 from mapctl.intent.path import find_reversals, walk_at_ease
 from mapctl.kinematics.moving import move_to, rotate_about_vertical
 from mapctl.motion import Motion
@@ -45,9 +45,11 @@ class FollowSettings:
     """Sigma of the arc behind or ahead of the requested one, metres."""
     footing: FootContact = field(default_factory=lambda: FootContact(landing=LandingSigmas()))
     """Contact term."""
-    noise: LatentPrior = field(default_factory=lambda: LatentPrior(sigma=3.0))
-    """Prior on the latent noise of the rollout. A well trained prior's own standard deviation is small: at sigma 2 the
-    same walk follows its path less well; at sigma 4 the prior of the free set is led outside its training data."""
+    noise: LatentPrior = field(default_factory=LatentPrior)
+    """Prior on the latent noise of the rollout."""
+    liveliness: float = 0.5
+    """Standard deviation of the noise that is drawn once for each frame, about which the prior is centred: 0 is the
+    most probable walk, smoother than captured ones."""
     window: HorizonSettings = field(default_factory=HorizonSettings)
     """Lengths of the receding horizon."""
     method: SingleWindowSolver = field(default_factory=LatentNoiseSolver)
@@ -88,7 +90,8 @@ def walk_arcs(
     ledger is of the prior's size.
     """
     unit_curve, unit_arcs = character.curve(curve), arcs / character.scale
-    follow_terms = build_follow_terms(unit_curve, unit_arcs, settings.scaled_to(character))
+    drawn = settings.liveliness * torch.randn(len(arcs), LAYOUT.continuous, generator=generator)
+    follow_terms = build_follow_terms(unit_curve, unit_arcs, settings.scaled_to(character), drawn)
 
     def all_terms(first: int, count: int) -> Sequence[Term]:
         return *follow_terms(first, count), *(character.term(term) for term in terms_of(first, count))
@@ -112,8 +115,10 @@ def walk_arcs(
     return motion, done, outcome
 
 
-def build_follow_terms(curve: Curve, arcs: Float[Tensor, " frames"], settings: FollowSettings) -> TermsOf:
-    """Build the terms of each window, for the requested arcs of all frames and the look-ahead beyond them."""
+def build_follow_terms(
+    curve: Curve, arcs: Float[Tensor, " frames"], settings: FollowSettings, drawn: Float[Tensor, "frames noise"]
+) -> TermsOf:
+    """Build the terms of each window, for the requested arcs and the drawn noise of all frames, look-ahead included."""
     path = Path(
         curve,
         arcs,
@@ -124,7 +129,9 @@ def build_follow_terms(curve: Curve, arcs: Float[Tensor, " frames"], settings: F
     )
 
     def terms(first: int, frames: int) -> Sequence[Term]:
-        return settings.noise, replace(path, arcs=arcs[first : first + frames]), settings.footing
+        window = slice(first, first + frames)
+        noise = replace(settings.noise, centre=drawn[window])
+        return noise, replace(path, arcs=arcs[window]), settings.footing
 
     return terms
 
@@ -162,12 +169,10 @@ def walk_spans(
     """Stand (in the pose `rest`) and walk along a trajectory, span by span; also return what was solved for each walk,
     and how that ended. `terms_of` is by frames of the shot.
 
-    Where a request is more than a walk, or slows in corners, a walk that leaves its trajectory or lunges is solved
-    again from another start: one gets stuck in a corner now and then.
+    A walk that leaves its trajectory or lunges is solved again with another start and other noise.
     """
     frames, outcome, walks_only = len(trajectory.speeds), Outcome.DONE, request.walks_only
     slowest = character.data_limits(prior.limits).slowest
-    tries = _TRIES if not walks_only or slows_in_corners(request, trajectory.curve) else 1
     pieces, walked = list[Piece](), list[CommittedFrames]()
 
     def shot_terms(begin: int, count: int) -> Sequence[Term]:
@@ -200,7 +205,7 @@ def walk_spans(
                 progress(min(span.start + done, span.stop), frames)
 
         best, least = None, math.inf
-        for _ in range(tries):
+        for _ in range(_TRIES):
             motion, done, outcome = walk_arcs(
                 prior,
                 curve,

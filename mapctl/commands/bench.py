@@ -90,7 +90,7 @@ def _time_evaluation(prior: Density, count: int, repeats: int) -> float:
     curve, settings = curves.circle(radius=4.0), FollowSettings()
     frames = settings.window.frames
     arcs = torch.arange(2 * frames, dtype=torch.float64) * _SPEED / PRIOR_FPS
-    terms_of = build_follow_terms(curve, arcs, settings)
+    terms_of = build_follow_terms(curve, arcs, settings, torch.zeros(len(arcs), LAYOUT.continuous))
     generator = torch.Generator().manual_seed(0)
     start = select_initial_state(
         prior, curve, arcs, terms_of, skeleton=CANONICAL, fps=PRIOR_FPS, generator=generator

@@ -1,6 +1,6 @@
 """`mapctl follow`: a character walks a drawn curve."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Annotated
@@ -42,6 +42,8 @@ class FollowCurve(ModelCommand, options.ReadOptions, ShotOptions):
     """TOML file of [[key]] tables: what hands and feet reach for, the head looks at, which pose is held, and when."""
     avoid: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="X,Z,RADIUS")] = ()
     """A disc on the ground to walk around, metres; may be given several times."""
+    variations: options.Count = 1
+    """Number of takes, each with the next seed; their files are OUT_000, OUT_001, ..."""
     fps: options.MaybeNumber = None
     """Frame rate of the motion; 30, or that of the clip it continues from, if not given."""
     video: options.MaybeFile = None
@@ -61,13 +63,22 @@ def run(command: FollowCurve) -> int:
     options.check_seed(command.seed)
     if command.fps is not None and not 1 <= command.fps <= 1000:
         raise RequestError(f"--fps must be 1 to 1000, got {command.fps:g}")
+    if command.variations < 1:
+        raise RequestError(f"--variations must be at least 1, got {command.variations}")
     formats.check_ending(command.out)
-    outputs.check_files(options.collect_paths(command.out, command.video, command.report))
+    takes = [command] if command.variations == 1 else [_number(command, take) for take in range(command.variations)]
+    outputs.check_files([path for take in takes for path in options.collect_paths(take.out, take.video, take.report)])
     if command.video is not None:
         outputs.check_film(command.video, outputs.FILM_SIZE)
     file = None if command.keys is None else ShotKeyFile.read(command.keys)
     with priors.use_weights(command.weights or (file and file.weights)):
-        return _follow(command, file)
+        return max(_follow(take, file) for take in takes)
+
+
+def _number(command: FollowCurve, take: int) -> FollowCurve:
+    paths = {"out": command.out, "video": command.video, "report": command.report}
+    numbered = {name: None if path is None else outputs.number_path(path, take) for name, path in paths.items()}
+    return replace(command, seed=command.seed + take, **numbered)
 
 
 def _follow(command: FollowCurve, file: ShotKeyFile | None) -> int:

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Annotated
@@ -43,6 +43,8 @@ class RunScene(ModelCommand, options.ReadOptions):
     rig: options.OutRig = "canonical"
     """Body of the actors whose `rig` the scene file does not give: the canonical one, or that of a clip, on whose rig
     they are written; or a rig by name or TOML file, whose joints get the canonical bones."""
+    variations: options.Count = 1
+    """Number of takes, each with the next seeds; their files are numbered: walk_000.bvh, walk_001.bvh, ..."""
     strict: bool = False
     """Exit with status 3 where not all that was asked of every actor holds."""
     quiet: bool = False
@@ -56,8 +58,17 @@ def run(command: RunScene) -> int:
     """
     path = Path(scenes.find_scene(command.scene))
     scene, curves = load(path)
+    if command.variations < 1:
+        raise RequestError(f"--variations must be at least 1, got {command.variations}")
+    takes = [scene] if command.variations == 1 else [_number(scene, take) for take in range(command.variations)]
     with priors.use_weights(command.weights or scene.weights):
-        return _run_scene(command, path, scene, curves)
+        return max(_run_scene(command, path, take, curves) for take in takes)
+
+
+def _number(scene: SceneDescription, take: int) -> SceneDescription:
+    actors = tuple(replace(actor, seed=actor.seed + take) for actor in scene.actors)
+    names = tuple(str(outputs.number_path(Path(name), take)) for name in scene.outputs)
+    return replace(scene, actors=actors, outputs=names)
 
 
 def _run_scene(command: RunScene, path: Path, scene: SceneDescription, curves: Sequence[Curve]) -> int:

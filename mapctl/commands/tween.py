@@ -154,7 +154,7 @@ def _check(command: Tween, request: KeyRequest | None) -> None:
         raise RequestError("--suggest-timing is for one answer; leave --variations out")
     if command.video is not None and command.video.suffix.lower() != ".png":
         raise RequestError("--video of several answers is a .png of stills; film OUT_000 by `mapctl render`")
-    first, *others = _number_paths(command)
+    first, *others = (outputs.number_path(command.out, number) for number in range(command.variations))
     results.check_destinations(first, command.video, *others, command.report, given=given)
 
 
@@ -177,12 +177,6 @@ def _read_keyframe_clip(command: Tween, request: KeyRequest | None) -> KeyframeC
     return KeyframeClip(motion, Keys.of(frames, limbs=limbs, root_only=command.root_only), rig)
 
 
-def _number_paths(command: Tween) -> list[Path]:
-    """Number the paths of variations: walk_000.bvh, walk_001.bvh, ... for walk.bvh."""
-    path = command.out
-    return [path.with_name(f"{path.stem}_{number:03d}{path.suffix}") for number in range(command.variations)]
-
-
 def _run_variations(
     command: Tween, clip: KeyframeClip, make: Tweening, models: ModelLoaders, dna: results.Examples
 ) -> bool:
@@ -203,8 +197,8 @@ def _run_variations(
             progress=progress,
         )
     keys, rows, strips, lines = len(clip.keys.frames), [], [], []
-    for one, file in zip(found.each, _number_paths(command), strict=True):
-        solution, motion = one.solution, one.solution.motion
+    for number, one in enumerate(found.each):
+        solution, motion, file = one.solution, one.solution.motion, outputs.number_path(command.out, number)
         outputs.save_motion(motion, file)
         styles = [by for by in dict.fromkeys(part.by for part in solution.sources) if _IN_STYLE in by]
         if command.report is not None:

@@ -139,13 +139,6 @@ class LatentNoise(Parametrisation):
         planned = context.prior.plan_search(context.expand_state(len(noise)), noise)
         return LatentNoise(context, *planned, holds_heels=True)
 
-    @staticmethod
-    def extend(warm_start: Float[Tensor, "ahead width"], frames: int) -> Float[Tensor, "1 unknowns"]:
-        """Return the last window's noise, and zero noise (the prior's plain continuation) beyond it."""
-        noise = warm_start.new_zeros(frames, LAYOUT.continuous)
-        noise[: len(warm_start)] = warm_start[:frames]
-        return noise.flatten().unsqueeze(0)
-
     def build(self, unknowns: Float[Tensor, "batch unknowns"]) -> Trial:
         """Build the trials of the noise by a rollout of the density; differentiable."""
         context = self.context

@@ -24,7 +24,7 @@ from mapctl.solver.budget import Budget, Meter
 from mapctl.solver.lbfgs import LbfgsResult, LbfgsSettings, minimise
 from mapctl.solver.swarm import SwarmResult, SwarmSettings, run_best_of_samples, run_swarm
 from mapctl.terms.base import Term
-from mapctl.terms.likelihood import Likelihood
+from mapctl.terms.likelihood import LatentPrior, Likelihood
 from mapctl.terms.trial import Trial
 
 WarmStartProposal = Callable[[WindowRequest, Float[Tensor, "1 unknowns"], Meter], Float[Tensor, "1 unknowns"]]
@@ -165,7 +165,7 @@ class LatentNoiseSolver:
     def __call__(self, request: WindowRequest) -> SolvedWindow:
         """Solve one window."""
         meter, frames = Meter(self.budget.within(request.seconds)), request.context.frames
-        start = self.proposal(request, LatentNoise.extend(request.warm_start, frames), meter)
+        start = self.proposal(request, _extend_warm_start(request), meter)
         unknowns, best = self._run_round(request, start, meter)
         start_energy = float(best.start_energy[0])
         for _ in range(self.rounds - 1):
@@ -181,6 +181,16 @@ class LatentNoiseSolver:
         unknowns = LatentNoise.begin_search(request.context, start)
         objective = Objective.of(unknowns, request.terms)
         return unknowns, minimise(objective.energy_and_gradient, start, settings=self.lbfgs, meter=meter)
+
+
+def _extend_warm_start(request: WindowRequest) -> Float[Tensor, "1 unknowns"]:
+    """Return the last window's noise, and beyond it the mean of its prior: a continuation without any other term."""
+    noise = request.warm_start.new_zeros(request.context.frames, LAYOUT.continuous)
+    for term in request.terms:
+        if isinstance(term, LatentPrior) and term.centre is not None:
+            noise[:] = term.centre
+    noise[: len(request.warm_start)] = request.warm_start[: len(noise)]
+    return noise.flatten().unsqueeze(0)
 
 
 @dataclass(frozen=True, eq=False)

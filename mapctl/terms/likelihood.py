@@ -34,25 +34,32 @@ class Likelihood:
         return -trial.require_log_density()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LatentPrior:
-    """The trial's noise is normal with mean 0: latents of a rollout, input noise or pose offsets."""
+    """The trial's noise is normal: latents of a rollout, input noise or pose offsets."""
 
     sigma: float = 1.0
     """Standard deviation of each number, in units of the noise, whose own is 1; above 1 leaves more of it."""
+    centre: Float[Tensor, "frames width"] | None = None
+    """Mean of each frame of the window; None is 0. A draw, with the most probable motion about it, is a sample of the
+    posterior (perturb and MAP, Papandreou and Yuille 2011)."""
     name: str = "noise"
     unit: str = "rms"
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the energies, nats: half the squared numbers of each frame over sigma squared."""
-        return 0.5 * (trial.require_noise() / self.sigma).square().sum(-1)
+        return 0.5 * (self._deviate(trial) / self.sigma).square().sum(-1)
 
     def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
         """Add the gradient of the summed energies of a float32 trial, and return the energies, nats."""
         energy = np.empty(gradient.log_density.shape)
-        kernels.add_latent_prior(trial.require_noise().numpy(), self.sigma, energy, gradient.noise)
+        kernels.add_latent_prior(self._deviate(trial).numpy(), self.sigma, energy, gradient.noise)
         return energy
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the root mean square of a frame's numbers."""
-        return trial.require_noise().square().mean(-1).sqrt()
+        return self._deviate(trial).square().mean(-1).sqrt()
+
+    def _deviate(self, trial: Trial) -> Float[Tensor, "batch frames width"]:
+        noise = trial.require_noise()
+        return noise if self.centre is None else noise - self.centre.to(noise)

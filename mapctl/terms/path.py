@@ -33,13 +33,13 @@ class Path:
     """Wanted arc of each frame of the window, metres."""
     joint: str = "hips"
     """Name of the joint that follows."""
-    sigma_slow: float = 0.025
+    sigma_slow: float = 0.01
     """Standard deviation of the sideways offset after a Gaussian of `slow_seconds`, metres."""
     free_sway: float = 0.03
     """Sideways offset that costs nothing by itself, metres: mocap sways by 1.9 cm rms."""
-    sigma_raw: float = 0.025
+    sigma_raw: float = 0.01
     """Standard deviation of the sideways offset beyond `free_sway`, metres."""
-    sigma_progress: float = 0.08
+    sigma_progress: float = 0.032
     """Standard deviation of the error of the arc, metres."""
     sigma_height: float = 0.03
     """Standard deviation of the height over a curve in space, metres."""

@@ -105,3 +105,18 @@ def test_a_loop_leads_into_its_first_frame_at_any_rate(tmp_path):
     positions = mapctl.load(out).joint_positions()
     steps = torch.diff(torch.cat([positions, positions[:1]]), dim=0).norm(dim=-1).amax(dim=1)
     assert float(steps[-1]) < 1.2 * float(steps[:-1].max())
+
+
+def test_variations_are_numbered_and_differ(tmp_path):
+    words = ["circle:2", "--seconds", 0.4, "--quiet"]
+    assert run("follow", *words, "-o", tmp_path / "a.bvh", "--report", tmp_path / "a.json", "--variations", 3) == 0
+    assert run("follow", *words, "-o", tmp_path / "last.bvh", "--seed", 2) == 0
+    written = [(tmp_path / f"a_{number:03d}.bvh").read_bytes() for number in range(3)]
+    assert len(set(written)) == 3
+    assert written[2] == (tmp_path / "last.bvh").read_bytes()
+    assert json.loads((tmp_path / "a_002.json").read_text())["seed"] == 2
+    scene = tmp_path / "scene.toml"
+    scene.write_text('outputs = ["b.npz"]\n[[actors]]\ncurve = "circle:2"\nseconds = 0.4\nseed = 1\n')
+    assert run("run", scene, "-o", tmp_path, "--variations", 2, "--quiet") == 0
+    found = [mapctl.load(tmp_path / f"b_{number:03d}.npz").root_position for number in range(2)]
+    assert not torch.equal(*found)

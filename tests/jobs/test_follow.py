@@ -63,11 +63,11 @@ def test_a_curve_that_rises_is_refused():
 
 def test_the_same_seed_gives_the_same_bytes_and_other_seeds_other_walks(tmp_path):
     curve = curves.circle(radius=2)
-    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+    for name, seed in enumerate((1, 1, 2, 3, 4)):
         follow(curve, seconds=0.5, seed=seed).motion.save(tmp_path / f"{name}.bvh")
-    written = {name: (tmp_path / f"{name}.bvh").read_bytes() for name in "abc"}
-    assert written["a"] == written["b"]
-    assert len(set(written.values())) > 1
+    written = [(tmp_path / f"{name}.bvh").read_bytes() for name in range(5)]
+    assert written[0] == written[1]
+    assert len(set(written)) == 4
 
 
 def interrupt_at(frames):

@@ -41,6 +41,11 @@ def check_files(paths: Sequence[Path], *, given: Sequence[Path] = ()) -> None:
         known.add(real)
 
 
+def number_path(path: Path, number: int) -> Path:
+    """Number the path of a variation: walk_000.bvh, walk_001.bvh, ... for walk.bvh."""
+    return path.with_name(f"{path.stem}_{number:03d}{path.suffix}")
+
+
 FILM_SIZE = (1280, 720)
 """Width and height of films whose size is not requested, pixels."""
 
