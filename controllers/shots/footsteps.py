@@ -14,13 +14,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl import kinematics, rotations
+from mapctl import contacts, kinematics, rotations
 from mapctl.curves import Curve
 from mapctl.features import PRIOR_FPS
 from mapctl.kinematics import inverse
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
 from mapctl.numerics.easing import smootherstep
+from mapctl.numerics.intervals import true_intervals
 from mapctl.skeleton import CANONICAL, FEET, LIMBS, TOES, leg_length
 
 _LEGS = [LIMBS[name] for name in FEET]
@@ -42,23 +43,28 @@ class Footstep:
     """Last frame, at PRIOR_FPS, in which the foot stands before."""
     land: int
     """First frame in which it stands again."""
-    share: float
-    """Share of the displacement at which a body stands squarely over the foothold."""
+    share: float = 1.0
+    """Share of a displacement at which a body stands squarely over the foothold."""
     toe: tuple[float, float] = (0.0, 0.0)
     """Toe joint on the foothold, x and z, world, metres."""
 
-    def later(self, frames: int) -> "Footstep":
-        """Return the step so many frames later."""
-        return replace(self, lift=self.lift + frames, land=self.land + frames)
-
-    def reverse(self, frames: int) -> "Footstep":
-        """Return the step of a motion of so many frames, backward in time."""
-        return replace(self, lift=frames - 1 - self.land, land=frames - 1 - self.lift)
-
     def as_row(self) -> dict[str, Any]:
         """Return the row of a report: foot, seconds of lift and landing, toe joint."""
-        seconds = {"lift_s": self.lift / PRIOR_FPS, "land_s": self.land / PRIOR_FPS}
+        seconds = {"lift_seconds": self.lift / PRIOR_FPS, "land_seconds": self.land / PRIOR_FPS}
         return {"foot": ("left", "right")[self.foot], **seconds, "toe": list(self.toe)}
+
+
+def find_footsteps(motion: Motion) -> list[Footstep]:
+    """Find the steps of a motion at PRIOR_FPS by its contacts."""
+    toes, found = motion.joint_positions()[:, list(CANONICAL.indices(TOES))], list[Footstep]()
+    for foot, first, stop in true_intervals(~contacts.detect_contacts(toes, motion.fps)):
+        if first > 0 and stop < motion.num_frames:
+            found.append(Footstep(foot, first - 1, stop, toe=tuple(toes[stop, foot, ::2].tolist())))
+    return sorted(found, key=lambda step: step.land)
+
+
+def _ground_pose(pose: Motion) -> Float[Tensor, "3"]:
+    return torch.cat([pose.root_position[0, ::2], kinematics.heading(pose.local_quat_xyzw[:, 0])]).double()
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,23 +79,31 @@ class Displacement:
     """Hips along it at even shares: x and z, metres, and heading, radians, without jumps of a turn."""
 
     @staticmethod
+    def between(start: Motion, stop: Motion, path: Float[Tensor, "points 3"] | None = None) -> "Displacement":
+        """Displace a body from one pose to another, straight or along a path of ground points and headings at even
+        shares, which is moved so that its ends are those of the poses."""
+        ends = torch.stack([_ground_pose(pose) for pose in (start, stop)])
+        path = ends[:1].expand(2, 3) if path is None else path
+        off = ends - path[[0, -1]]
+        off[:, 2] = rotations.wrap_angle(off[:, 2])
+        off[1, 2] = off[0, 2] + rotations.wrap_angle(off[1, 2] - off[0, 2])
+        share = torch.linspace(0, 1, len(path), dtype=path.dtype)
+        return Displacement(start, stop, path + torch.lerp(off[0], off[1], share[:, None]))
+
+    @staticmethod
     def along(curve: Curve, arcs: Float[Tensor, "2"], start: Motion, stop: Motion) -> "Displacement":
-        """Displace a body along a curve between two arcs, metres; the ends are those of the poses."""
+        """Displace a body along a curve between two arcs, metres."""
         points = max(2, math.ceil(float(arcs[1] - arcs[0]) / _TRACK_STEP) + 1)
-        at, share = (
-            torch.lerp(arcs[0], arcs[1], torch.linspace(0, 1, points, dtype=arcs.dtype)),
-            torch.linspace(0, 1, points),
-        )
-        heading = curve.heading(at)
-        track = torch.cat([curve.ground_point(at), heading[:, None]], dim=-1)
-        ends = [
-            torch.cat([pose.root_position[0, ::2], kinematics.heading(pose.local_quat_xyzw[:, 0])])
-            for pose in (start, stop)
-        ]
-        off = torch.stack([end.to(track) - track[at] for end, at in zip(ends, (0, -1), strict=True)])
-        track = track + torch.lerp(off[0], off[1], share.to(track)[:, None])
-        track[:, 2] = rotations.unwrap_angle(track[:, 2])
-        return Displacement(start, stop, track)
+        at = torch.lerp(arcs[0], arcs[1], torch.linspace(0, 1, points, dtype=arcs.dtype))
+        heading = rotations.unwrap_angle(curve.heading(at))
+        return Displacement.between(start, stop, torch.cat([curve.ground_point(at), heading[:, None]], dim=-1))
+
+    @property
+    def moves_feet(self) -> bool:
+        """Whether a foot stands elsewhere afterwards."""
+        ends = torch.tensor([0.0, 1.0], dtype=torch.float64)
+        moved = [self.toes_at(foot, ends)[0][:, ::2].diff(dim=0).norm() for foot in range(2)]
+        return float(max(moved)) > _MOVED
 
     @property
     def distance(self) -> float:
@@ -307,7 +321,7 @@ class LastSteps:
             swing = max(_FASTEST_LANDING, min(_SWING, swing))
         landed = min(self.start + swing, self.stop - 2)
         last = min(self.stop, landed + 1 + _SWING)
-        steps = [Footstep(first, self.start, landed, 1.0), Footstep(1 - first, landed + 1, last, 1.0)]
+        steps = [Footstep(first, self.start, landed), Footstep(1 - first, landed + 1, last)]
         ground = toes[self.stop][:, ::2].tolist()
         return [replace(step, toe=tuple(ground[step.foot])) for step in steps if float(away[step.foot]) > _MOVED]
 

@@ -283,6 +283,7 @@ def _find_lacking_below(motion: Motion, reach: Reach, frame: int) -> float:
 
 _WIDTHS = (10, 16, 24, 36)  # frames on either side of a key that are tried
 _MOST_WIDTH = 75
+_MET_METRES, _MET_DEGREES = 5e-4, 0.05  # of a key that is met without a change
 _POSE_TOLERANCE_SHARE = 0.95  # of a tolerance that is used
 _MOST_EASINGS = 8
 _HIPS_SPEED, _JOINT_SPEED, _TURN_RATE = 1.3, 2.0, 2.5  # m/s, m/s about the hips, rad/s: at most, towards a key
@@ -316,6 +317,9 @@ def meet_poses(
     waiting = sorted(keys, key=lambda key: key.seconds)
     for number, key in enumerate(waiting):
         earliest = met[-1].stop if met else 0
+        if (already := _find_met(motion, key, trajectory)) is not None:
+            met.append(already)
+            continue
         following = [_frame_of(other.seconds, motion) - other.within_frames for other in waiting[number + 1 :]]
         latest = min([motion.num_frames, *following])
         tried = list(_list_fillings(motion, key, trajectory, earliest, latest))
@@ -326,6 +330,15 @@ def meet_poses(
             motion = filling.motion
         met.append(chosen)
     return motion, tuple(met)
+
+
+def _find_met(motion: Motion, key: PoseKey, trajectory: Trajectory) -> MetPose | None:
+    """Return a key as met where the motion meets it already; None where it does not."""
+    start = _frame_of(key.seconds, motion)
+    stop = min(motion.num_frames, start + round(key.hold_seconds * PRIOR_FPS) + 1)
+    found = MetPose(key, trajectory.pose_at_key(motion.slice(start, start + 1), key, start), start, stop)
+    metres, degrees = measure_pose_error(motion, found)
+    return found if metres < _MET_METRES and (degrees < _MET_DEGREES or not key.gives_facing) else None
 
 
 def measure_pose_error(motion: Motion, met: MetPose) -> tuple[float, float]:
@@ -344,7 +357,7 @@ def as_reaches(keys: Sequence[PoseKey], trajectory: Trajectory, found: Motion) -
     for key in keys:
         if key.joints:
             frame = min(round(key.seconds * PRIOR_FPS), len(trajectory.arcs) - 1)
-            positions = _place_pose(found, key, trajectory, frame).joint_positions()[0]
+            positions = trajectory.pose_at_key(found, key, frame).joint_positions()[0]
             goals = {name: tuple(positions[CANONICAL.index(name)].tolist()) for name in key.joints}
             reaches.append(Reach(key.seconds, goals, key.hold_seconds, key.tolerance, key.within_frames))
     return tuple(reaches)
@@ -372,7 +385,7 @@ def _list_fillings(
     for shift in sorted(shifts, key=abs):
         start = max(earliest, min(_frame_of(key.seconds, motion) + shift, latest - 1))
         stop = min(start + hold, latest)
-        asked = _place_pose(motion.slice(start, start + 1), key, trajectory, start)
+        asked = trajectory.pose_at_key(motion.slice(start, start + 1), key, start)
         shown = _relax(asked, motion.slice(start, start + 1), key)
         least = _find_least_width(motion, shown, start)
         for width in sorted({min(_MOST_WIDTH, max(least, width)) for width in _WIDTHS}):
@@ -380,29 +393,6 @@ def _list_fillings(
                 motion, key, shown, (start, stop), (max(earliest, start - width), min(latest, stop + width))
             )
             yield found, MetPose(replace(key, seconds=start / PRIOR_FPS), asked, start, stop)
-
-
-def _place_pose(found: Motion, key: PoseKey, trajectory: Trajectory, frame: int) -> Motion:
-    """Return one frame as a key asks for it, what it does not give as found; a pose without a position and a facing is
-    on the trajectory and along it."""
-    pose = found if key.pose is None else key.pose
-    root, quats = pose.root_position.double().clone(), pose.local_quat_xyzw.double().clone()
-    arc = trajectory.arcs[frame : frame + 1]
-    if key.place is not None:
-        root[0, ::2] = root.new_tensor(key.place)
-    elif key.pose is not None:
-        root[0, ::2] = trajectory.curve.ground_point(arc)
-    if key.height is not None:
-        root[0, 1] = key.height
-    angle = None
-    if key.facing_deg is not None:
-        angle = torch.deg2rad(root.new_tensor([key.facing_deg]))
-    elif key.pose is not None:
-        angle = trajectory.curve.heading(arc).to(root)
-    if angle is not None:
-        turn = rotations.about_y(angle - kinematics.heading(quats[:, 0]))
-        quats[:, 0] = rotations.multiply(turn, quats[:, 0])
-    return replace(found, root_position=root, local_quat_xyzw=quats)
 
 
 def _relax(asked: Motion, found: Motion, key: PoseKey) -> Motion:

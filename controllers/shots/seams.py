@@ -14,7 +14,7 @@ from torch import Tensor
 
 from controllers.common.map_refinement import estimate_rest_height
 from controllers.inbetweening.pipeline import InfillSettings, fill
-from controllers.shots.footsteps import Displacement, Footstep, LastSteps, plan_footsteps, take_steps
+from controllers.shots.footsteps import Displacement, LastSteps, plan_footsteps, take_steps
 from controllers.shots.request import Arrival, Lead
 from controllers.shots.trajectory import Span, Trajectory
 from controllers.shots.walk import Piece
@@ -135,38 +135,32 @@ class JoinedPieces:
     """All frames of the shot."""
     missing: Bool[Tensor, " frames"]
     """Frames that the in-betweener is to generate."""
-    footsteps: tuple[Footstep, ...]
-    """Steps between stands that no walk connects."""
     first_steps: tuple[tuple[int, int], ...]
     """Frames start to stop of transitions from a stand to a walk."""
     last_steps: tuple[tuple[int, int], ...]
     """Frames start to stop of transitions from a walk to a stand."""
 
-    def settle(self, motion: Motion) -> tuple[Motion, tuple[Footstep, ...]]:
-        """Let feet step where transitions have been generated: a foot stands while the other one swings. Also return
-        all footsteps."""
-        found, frames = [*self.footsteps], motion.num_frames
+    def settle(self, motion: Motion) -> Motion:
+        """Let feet step where transitions have been generated: a foot stands while the other one swings."""
         for start, stop in self.last_steps:
-            last = LastSteps(motion, start - 1, stop)
-            motion, found = _insert(motion, last.take(), start - 1), [*found, *last.plan()]
+            motion = _insert(motion, LastSteps(motion, start - 1, stop).take(), start - 1)
         for start, stop in self.first_steps:  # backward in time a first step is a last one
+            frames = motion.num_frames
             last = LastSteps(motion.reverse(), frames - 1 - stop, frames - start)
             motion = _insert(motion, last.take().reverse(), start - 1)
-            found += [step.reverse(frames) for step in last.plan()]
-        return motion, tuple(sorted(found, key=lambda step: step.lift))
+        return motion
 
 
 def join_pieces(pieces: Sequence[Piece], trajectory: Trajectory, inbetweener: Inbetweener) -> JoinedPieces:
     """Join pieces: two stands by footsteps, others by the transitions that cost least."""
-    joined, footsteps = pieces[0].motion, list[Footstep]()
+    joined = pieces[0].motion
     missing = torch.zeros(joined.num_frames, dtype=torch.bool)
     earliest, first_steps, last_steps = 0, list[tuple[int, int]](), list[tuple[int, int]]()
     for before, after in pairwise(pieces):
         if before.span.what == after.span.what == "stand":
-            start, steps, plan = _step_across(before, after, trajectory, earliest)
+            start, steps = _step_across(before, after, trajectory, earliest)
             stop = start + steps.num_frames - 1
             joined = _insert(_join_across(joined, after.motion, stop), steps, start)
-            footsteps += plan
             earliest = stop
             continue
         stops = after.span.what == "stand"
@@ -183,7 +177,7 @@ def join_pieces(pieces: Sequence[Piece], trajectory: Trajectory, inbetweener: In
         if before.span.what != after.span.what:
             (last_steps if stops else first_steps).append((start, stop))
         earliest = stop + _SETTLED
-    return JoinedPieces(joined, missing, tuple(footsteps), tuple(first_steps), tuple(last_steps))
+    return JoinedPieces(joined, missing, tuple(first_steps), tuple(last_steps))
 
 
 def _keep_comfortable(candidates: Sequence[Filling], *, stops: bool) -> list[Filling]:
@@ -198,11 +192,9 @@ def _keep_comfortable(candidates: Sequence[Filling], *, stops: bool) -> list[Fil
     return [candidates[at] for at in order[:_TRIED_TRANSITIONS] if strains[at] <= strains[order[0]] + _NEARLY]
 
 
-def _step_across(
-    before: Piece, after: Piece, trajectory: Trajectory, earliest: int
-) -> tuple[int, Motion, list[Footstep]]:
-    """Step from one stand to the next along a trajectory; return the first frame, the motion and the footsteps. Where
-    speeds give too little time, the stands do."""
+def _step_across(before: Piece, after: Piece, trajectory: Trajectory, earliest: int) -> tuple[int, Motion]:
+    """Step from one stand to the next along a trajectory; return the first frame and the motion. Where speeds give too
+    little time, the stands do."""
     frames = after.motion.num_frames
     first = max(earliest, before.span.start + (_STILL_START if before.span.start == 0 else 1))
     latest = frames - _STILL_END if after.span.stop == frames else after.span.stop - 1
@@ -213,7 +205,7 @@ def _step_across(
     start = max(min(left, first), left - max(0, short) // 2)
     stop = min(max(reached, latest), start + max(reached - start, displacement.count_frames() - 1))
     plan = plan_footsteps(displacement, stop - start + 1)
-    return start, take_steps(displacement, plan, stop - start + 1), [step.later(start) for step in plan]
+    return start, take_steps(displacement, plan, stop - start + 1)
 
 
 def _lay_transitions(before: Span, after: Span, frames: int, earliest: int) -> list[tuple[int, int]]:
@@ -254,8 +246,12 @@ def go_on(motion: Motion, missing: Bool[Tensor, " frames"], lead: Lead, inbetwee
 
 
 def arrive(motion: Motion, arrival: Arrival, inbetweener: Inbetweener) -> Motion:
-    """Generate the last steps of a shot's motion anew so that it ends in an arrival, which is in position."""
+    """Generate the last steps of a shot's motion anew so that it ends in an arrival, which is in position; a motion
+    that ends there already stays."""
     last = motion.num_frames - 1
+    off = motion.slice(last, last + 1).joint_positions() - arrival.motion.slice(0, 1).joint_positions()
+    if float(off.norm(dim=-1).max()) < 1e-3:
+        return motion
     longer = replace(
         motion,
         root_position=torch.cat([motion.root_position[:-1], arrival.motion.root_position]),

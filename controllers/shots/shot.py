@@ -15,7 +15,7 @@ import torch
 from controllers.common.character import Character
 from controllers.inbetweening.pipeline import fill
 from controllers.shots.constraints import Constraint, check_constraints, describe_conflicts
-from controllers.shots.footsteps import Footstep
+from controllers.shots.footsteps import find_footsteps
 from controllers.shots.reaching import (
     MetPose,
     ReachTargets,
@@ -67,14 +67,11 @@ class ShotSolution(Solution):
     met: tuple[MetPose, ...] = ()
     """Keys of poses, positions and facings, as they were met."""
 
-    footsteps: tuple[Footstep, ...] = ()
-    """Steps from one stand to the next, and the first and last ones beside a stand, in frames of the motion."""
-
     def details(self) -> dict:
         """Return the constraints and the footsteps."""
         return {
             "constraints": [constraint.as_row() for constraint in self.constraints],
-            "footsteps": [step.as_row() for step in self.footsteps],
+            "footsteps": [step.as_row() for step in find_footsteps(self.motion)],
         }
 
 
@@ -124,10 +121,10 @@ def solve_shot(
         progress=progress,
         deadline=None if deadline_seconds is None else time.monotonic() + deadline_seconds,
     )
-    motion, reaches, met, footsteps = pieces[0].motion, request.reaches, (), ()
+    motion, reaches, met = pieces[0].motion, request.reaches, ()
     if inbetweener is not None:
         joined = join_pieces(pieces, trajectory, inbetweener)
-        motion, footsteps = _finish_ends(joined, request, trajectory, inbetweener)
+        motion = _finish_ends(joined, request, trajectory, inbetweener)
         motion, reaches, met = _meet_keys(motion, request, trajectory, inbetweener)
     notes = [trajectory.note] if trajectory.note else []
     if request.walks_only:
@@ -148,28 +145,24 @@ def solve_shot(
         constraints=constraints,
         reaches=reaches,
         met=met,
-        footsteps=footsteps,
     )
 
 
 def _finish_ends(
     joined: JoinedPieces, request: ShotRequest, trajectory: Trajectory, inbetweener: Inbetweener
-) -> tuple[Motion, tuple[Footstep, ...]]:
-    """Generate the missing frames, and let the motion continue from, end in, or come round to what is requested. Also
-    return the footsteps beside stands."""
+) -> Motion:
+    """Generate the missing frames, and let the motion continue from, end in, or come round to what is requested."""
     motion, missing, past = joined.motion, joined.missing, None
     if request.lead is not None:
         motion, past = go_on(motion, missing, request.lead, inbetweener), request.lead.past
     elif bool(missing.any()):
         motion = fill_frames(motion, missing, inbetweener)
-    motion, footsteps = joined.settle(motion)
-    motion = repair_jumps(motion, inbetweener, past=past)
+    motion = repair_jumps(joined.settle(motion), inbetweener, past=past)
     if request.loop:
         motion = close_loop(motion, len(trajectory.speeds), inbetweener)
     if request.arrival is not None:
-        arrival = request.arrival.bring_to(trajectory.curve, float(trajectory.arcs[-1]))
-        motion = arrive(motion, arrival, inbetweener)
-    return motion, footsteps
+        motion = arrive(motion, request.arrival.bring_to(trajectory.curve, float(trajectory.arcs[-1])), inbetweener)
+    return motion
 
 
 def _meet_keys(

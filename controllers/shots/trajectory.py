@@ -14,13 +14,16 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-from controllers.shots.request import Others, ShotRequest
-from mapctl import curves, rotations
+from controllers.shots.footsteps import Displacement
+from controllers.shots.request import Others, PoseKey, ShotRequest
+from mapctl import curves, kinematics, rotations
 from mapctl.curves import Curve
 from mapctl.curves.obstacles import measure_clearance
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.path import PathRequest, SpeedProfile, TimedSpeed, find_reversals, integrate_speeds, walk_at_ease
+from mapctl.kinematics.moving import move_to, rotate_about_vertical
+from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
 
 ClearanceOf = Callable[[Float[Tensor, "arcs offsets 2"], Float[Tensor, " arcs"]], Float[Tensor, "arcs offsets"]]
@@ -117,7 +120,7 @@ _SHORTEST_WALK = 15  # frames, without a stand on either side
 _SHORTEST_BETWEEN_STANDS = 30  # frames, less than two steps: footsteps lead from one stand to the next instead
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Span:
     """Frames start to stop in which a character stands or walks."""
 
@@ -127,25 +130,59 @@ class Span:
     """First frame."""
     stop: int
     """One past the last frame."""
-    facing: float = 0.0
-    """Metres along the curve, from where it stands, at which the curve leads where the character faces."""
+    pose: Motion | None = None
+    """Pose of a stand, one frame."""
 
 
-def split_turns(spans: Sequence[Span], trajectory: "Trajectory") -> list[Span]:
-    """Split a stand where the curve reverses: one before and one after, between which the character turns."""
-    found = list[Span]()
+def lay_stands(spans: Sequence[Span], trajectory: "Trajectory", request: ShotRequest, rest: Motion) -> list[Span]:
+    """Give each stand its pose: at rest on the trajectory, or that of the clip that is continued or ended in.
+
+    A stand is split where the curve reverses, and where keys displace its feet; the character steps from one part to
+    the next."""
+    found, frames = list[Span](), len(trajectory.arcs)
     for span in spans:
-        arc = trajectory.arcs[[span.start]]
-        before, after = (trajectory.curve.heading(arc + side * _CORNER) for side in (-1.0, 1.0))
-        turned = abs(float(rotations.wrap_angle(after - before)))
-        within = span.start > 0 and span.stop < len(trajectory.arcs)
-        if span.what == "walk" or not within or turned < _REVERSAL:
+        if span.what == "walk":
             found.append(span)
             continue
-        held = max(1, (span.stop - span.start - round(_TURN_SECONDS * PRIOR_FPS)) // 2)
-        found.append(Span("stand", span.start, span.start + held, -_CORNER))
-        found.append(Span("stand", span.stop - held, span.stop, _CORNER))
+        arc = trajectory.arcs[span.start]
+        before, after = (trajectory.curve.heading(arc + side * _CORNER) for side in (-1.0, 1.0))
+        inside = span.start > 0 and span.stop < frames
+        if inside and abs(float(rotations.wrap_angle(after - before))) >= _REVERSAL:
+            held = max(1, (span.stop - span.start - round(_TURN_SECONDS * PRIOR_FPS)) // 2)
+            found.append(Span("stand", span.start, span.start + held, trajectory.stand(rest, arc, before)))
+            found.append(Span("stand", span.stop - held, span.stop, trajectory.stand(rest, arc, after)))
+            continue
+        pose = trajectory.stand(rest, arc, trajectory.curve.heading(arc))
+        if span.start == 0 and request.lead is not None:
+            pose = request.lead.last_pose
+        elif span.stop == frames and request.arrival is not None:
+            pose = request.arrival.bring_to(trajectory.curve, float(trajectory.arcs[-1])).motion.slice(0, 1)
+        found += _split_at_keys(replace(span, pose=pose), trajectory, request.poses)
     return found
+
+
+def _split_at_keys(span: Span, trajectory: "Trajectory", keys: Sequence[PoseKey]) -> list[Span]:
+    """Split a stand at the keys for which a foot has to step, and there is time to: there, and back again after it."""
+    found, base = list[Span](), span.pose
+    assert base is not None
+    for key in sorted(keys, key=lambda key: key.seconds):
+        first = round(key.seconds * PRIOR_FPS)
+        stop = min(span.stop, first + round(key.hold_seconds * PRIOR_FPS) + 1)
+        now = replace(span, pose=base) if not found else found[-1]
+        assert now.pose is not None
+        if not span.start < first < span.stop:
+            continue
+        asked = trajectory.pose_at_key(base, key, first)
+        there, back = Displacement.between(now.pose, asked), Displacement.between(asked, base)
+        leave, home = first - there.count_frames() + 1, stop + back.count_frames() - 2
+        if leave <= now.start or not there.moves_feet:
+            continue
+        found[-1:] = [replace(now, stop=leave + 1), Span("stand", first, stop, asked)]
+        if home < span.stop:
+            found.append(Span("stand", home, span.stop, base))
+        else:
+            found[-1] = replace(found[-1], stop=span.stop)
+    return found or [span]
 
 
 def lay_timeline(speeds: Float[Tensor, " frames"], *, slowest: float) -> list[Span]:
@@ -259,6 +296,32 @@ class Trajectory:
     """Changes to the request, or the reason why it cannot hold."""
     blocked: bool = False
     """Whether no path leads around the obstacles and past the others."""
+
+    def stand(self, rest: Motion, arc: Tensor, heading: Tensor) -> Motion:
+        """Bring one frame onto the curve at an arc, metres, with a heading, radians."""
+        return move_to(rotate_about_vertical(rest, heading), self.curve.ground_point(arc))
+
+    def pose_at_key(self, found: Motion, key: PoseKey, frame: int) -> Motion:
+        """Return one frame as a key asks for it, what it does not give as found; a pose without a position and a facing
+        is on the curve and along it."""
+        pose = found if key.pose is None else key.pose
+        root, quats = pose.root_position.double().clone(), pose.local_quat_xyzw.double().clone()
+        arc = self.arcs[frame : frame + 1]
+        if key.place is not None:
+            root[0, ::2] = root.new_tensor(key.place)
+        elif key.pose is not None:
+            root[0, ::2] = self.curve.ground_point(arc)
+        if key.height is not None:
+            root[0, 1] = key.height
+        angle = None
+        if key.facing_deg is not None:
+            angle = torch.deg2rad(root.new_tensor([key.facing_deg]))
+        elif key.pose is not None:
+            angle = self.curve.heading(arc).to(root)
+        if angle is not None:
+            turn = rotations.about_y(angle - kinematics.heading(quats[:, 0]))
+            quats[:, 0] = rotations.multiply(turn, quats[:, 0])
+        return replace(found, root_position=root, local_quat_xyzw=quats)
 
     def slice(self, frames: int) -> "Trajectory":
         """Return the first frames."""

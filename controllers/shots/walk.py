@@ -12,13 +12,12 @@ from torch import Tensor
 from controllers.common.character import Character
 from controllers.common.initial_state import MotionStart, select_initial_state
 from controllers.shots.request import ShotRequest
-from controllers.shots.trajectory import Span, Trajectory, cut_curve, lay_timeline, split_turns
+from controllers.shots.trajectory import Span, Trajectory, cut_curve, lay_stands, lay_timeline
 from mapctl.curves import Curve
 from mapctl.curves.tracking import track_arcs
 from mapctl.errors import MapctlError
 from mapctl.features import LAYOUT, PRIOR_FPS
 from mapctl.intent.path import find_reversals, walk_at_ease
-from mapctl.kinematics.moving import move_to, rotate_about_vertical
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
 from mapctl.pose import decode
@@ -186,12 +185,12 @@ def walk_spans(
 
     spans = [Span("walk", 0, frames)]
     if not walks_only:
-        spans = split_turns(lay_timeline(trajectory.speeds, slowest=slowest), trajectory)
+        spans = lay_stands(lay_timeline(trajectory.speeds, slowest=slowest), trajectory, request, rest)
     for span in spans:
         lead = request.lead if span.start == 0 else None
         if span.what == "stand":
-            standing = _stand(rest, trajectory, span) if lead is None else lead.last_pose
-            pieces.append(Piece(span, _spread_over(standing, 0, frames)))
+            assert span.pose is not None
+            pieces.append(Piece(span, _spread_over(span.pose, 0, frames)))
             continue
         tail = TAIL if span.stop < frames else 0
         length = span.stop - span.start + tail
@@ -254,13 +253,6 @@ def _measure_fault(motion: Motion, wanted: Float[Tensor, "frames 2"]) -> float:
 def _extend(arcs: Float[Tensor, " frames"], more: int) -> Float[Tensor, " ahead"]:
     """Go on at the last speed."""
     return torch.cat([arcs, arcs[-1] + (arcs[-1] - arcs[-2]) * torch.arange(1, more + 1)])
-
-
-def _stand(rest: Motion, trajectory: Trajectory, span: Span) -> Motion:
-    """Stand on the trajectory during a span, facing along it."""
-    arc = trajectory.arcs[span.start]
-    heading = trajectory.curve.heading(arc + span.facing)
-    return move_to(rotate_about_vertical(rest, heading), trajectory.curve.ground_point(arc))
 
 
 def _spread_over(motion: Motion, start: int, frames: int) -> Motion:
