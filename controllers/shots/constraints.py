@@ -16,14 +16,15 @@ from controllers.shots.trajectory import Trajectory
 from mapctl.curves.obstacles import measure_clearance
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.effector_targets import compute_target_errors
-from mapctl.metrics.body import measure_glide
+from mapctl.metrics.body import measure_accelerations, measure_worst
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, FEET, LIMBS, TOES
 
 _PATH_CM, _PROGRESS_CM, _REACH_CM, _POSE_CM = 15.0, 50.0, 1.0, 0.1
 _FACING_DEG, _LOOK_DEG, _STILL_CM_S = 0.1, 15.0, 6.0
+# Captured walks, runs and gestures stay within these (`mapctl measure FOLDER`, the column of the largest).
 _GLIDE_CM, _GLIDE_RUNNING_CM, _RUNNING = 4.0, 15.0, 2.0  # of a walk, and from this speed on, m/s
-_ACCELERATION = 90.0  # m/s^2 of any joint at PRIOR_FPS: captured walks, runs and gestures stay below
+_UNSUPPORTED, _DEPTH_CM, _ACCELERATION = 0.3, 1.0, 90.0  # seconds; of a toe; m/s^2 of any joint at PRIOR_FPS
 _SEAM_RATIO = 1.2  # of a loop's largest step from one frame to the next
 _NEAR_KEY_SECONDS = 1.0
 _ASIDE = 0.05  # metres beside the curve, from which on a trajectory is bent toward a reach
@@ -115,18 +116,18 @@ def check_constraints(
 
 
 def _check_motion(positions: Float[Tensor, "frames joints 3"]) -> list[Constraint]:
-    """Measure what a viewer sees of any motion: feet that glide without a step, and the largest acceleration."""
+    """Measure what a viewer sees of any motion, in its worst frames."""
     if len(positions) < 3:
         return []
-    glide = 100 * measure_glide(positions[:, [*CANONICAL.indices(TOES), *CANONICAL.indices(FEET)]], PRIOR_FPS)
+    worst = measure_worst(positions, 0, CANONICAL.indices(TOES), CANONICAL.indices(FEET), PRIOR_FPS)
     speed = float(positions[:, 0, ::2].diff(dim=0).norm(dim=-1).max()) * PRIOR_FPS
-    limit = _GLIDE_CM if speed < _RUNNING else _GLIDE_RUNNING_CM
-    acceleration = positions.diff(n=2, dim=0).norm(dim=-1).amax(dim=1) * PRIOR_FPS**2
-    worst = int(acceleration.argmax())
-    asked = f"as captured, at {(worst + 1) / PRIOR_FPS:.2f} s"
+    glide = _GLIDE_CM if speed < _RUNNING else _GLIDE_RUNNING_CM
+    at = (int(measure_accelerations(positions, PRIOR_FPS).argmax()) + 1) / PRIOR_FPS
     return [
-        Constraint("feet", "a step for every displacement", glide, limit, "cm"),
-        Constraint("acceleration", asked, float(acceleration[worst]), _ACCELERATION, "m/s^2"),
+        Constraint("feet", "a step for every displacement", worst["glide_cm"], glide, "cm"),
+        Constraint("support", "a foot on the ground, or flight", worst["unsupported_max_s"], _UNSUPPORTED, "s"),
+        Constraint("ground", "no toe below", worst["depth_max_cm"], _DEPTH_CM, "cm"),
+        Constraint("acceleration", f"at {at:.2f} s", worst["acceleration_max_m_s2"], _ACCELERATION, "m/s^2"),
     ]
 
 

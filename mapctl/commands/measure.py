@@ -28,8 +28,8 @@ class Measure(ModelCommand, options.RigOptions):
 
     Of a clip also its cycle, of a walk or a run one stride, or that it has none.
     All are measured as mocap's values were: on canonical joints with Y up, at 30 frames a second if there are more. Of
-    a folder the means over its clips; beside a folder of mocap also how well a classifier separates the two. Clips of a
-    folder that cannot be measured are left out and listed.
+    a folder the means and the largest values over its clips; beside a folder of mocap also how well a classifier
+    separates the two. Clips of a folder that cannot be measured are left out and listed.
     """
 
     prints_licence: ClassVar[bool] = False
@@ -115,6 +115,14 @@ class _ClipSet:
         names, rows = self.measures[0], self.measures
         return {name: float(torch.tensor([row[name] for row in rows], dtype=torch.float64).nanmean()) for name in names}
 
+    @property
+    def largest(self) -> dict[str, float]:
+        """Largest value of each measure among the clips that can give it."""
+        return {
+            name: max((row[name] for row in self.measures if row[name] == row[name]), default=math.nan)
+            for name in self.measures[0]
+        }
+
     @staticmethod
     def read(folder: Path, *, with_windows: bool, rig: Rig | None = None) -> "_ClipSet":
         """Read and measure clips of a rig. A file that cannot be read, measured or cut into windows is left out;
@@ -156,6 +164,7 @@ def _measure_folders(command: Measure) -> dict[str, Any]:
         "clip": str(command.clip),
         "clips": len(ours.measures),
         "measures": ours.means,
+        "largest": ours.largest,
         "reference": {},
         "mocap": _read_mocap_values(),
         "notes": ours.notes,
@@ -181,13 +190,17 @@ def _measure_folders(command: Measure) -> dict[str, Any]:
 def _print_tables(values: Mapping[str, Any]) -> None:
     """Print measures, and realism where it is measured, each as a table."""
     reference, mocap = values["reference"], values["mocap"]
+    columns = {"ours": values["measures"], "reference": reference}
+    if "largest" in values:
+        columns = {"mean": values["measures"], "largest": values["largest"], "mean of the reference": reference}
     rows = [
-        [name, value, reference.get(name), _format_range(mocap.get(name))] for name, value in values["measures"].items()
+        [name, *(column.get(name) for column in columns.values()), _format_range(mocap.get(name))]
+        for name in values["measures"]
     ]
-    title = None if "clips" not in values else f"means over {values['clips']} clips"
+    title = None if "clips" not in values else f"over {values['clips']} clips"
     if "reference_clips" in values:
         title = f"{title}, and over {values['reference_clips']} of the reference"
-    print_table(["measure", "ours", "reference", "mocap (2 to 98 %)"], rows, title=title)
+    print_table(["measure", *columns, "mocap (2 to 98 %)"], rows, title=title)
     if "realism" in values:
         _print_realism(values["realism"])
     if "cycle" in values:

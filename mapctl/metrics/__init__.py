@@ -53,8 +53,10 @@ def measure(
 
     Always: `skate_cm_s`, `skate_ratio`, `contact_speed_cm_s`, `planted_share`, `penetration_cm`, `float_cm`,
     `heel_contact_speed_cm_s`, `heel_planted_share`, `heel_slide_max_cm` and `foot_turn_deg_s` (canonical joints alone
-    tell where heels are, else NaN), `jitter_m_s3`, `speed_m_s`, `turned_deg`, `turn_rate_deg_s`, `hips_height_m`,
-    `pose_variation_cm`, and `sway_cm`: from the straight line between the walk's ends, or from the curve. With a curve
+    show where heels are, else NaN), the worst frames `glide_cm`, `unsupported_max_s`, `depth_max_cm` and
+    `acceleration_max_m_s2` (see `body.measure_worst`), `jitter_m_s3`, `speed_m_s`, `turned_deg`, `turn_rate_deg_s`,
+    `hips_height_m`, `pose_variation_cm`, and `sway_cm`: from the straight line between the walk's ends, or from the
+    curve. With a curve
     also `path_error_{mean,p95,max}_cm`, `path_error_low_passed_{mean,p95,max}_cm` and `travelled_m`; with the wanted
     `speed` (m/s) `wanted_m` and `progress_ratio` too. `joint` names the one that follows the curve, else the hips do.
     MapctlError for rigs whose hips, legs or feet are not found, unknown joints and motions of one frame.
@@ -62,11 +64,13 @@ def measure(
     if motion.num_frames < 2:
         raise RequestError("measures need a motion of at least 2 frames")
     positions, fps, hips = motion.joint_positions(), float(motion.fps), find_hips(motion.skeleton)
-    measures = _measure_feet(positions[:, list(find_feet(motion.skeleton))], fps)
+    toes = list(find_feet(motion.skeleton))
+    measures = _measure_feet(positions[:, toes], fps)
     if motion.skeleton.names == CANONICAL.names:  # other rigs do not show where heels are
         measures |= feet.measure_heels(motion)
     else:
         measures |= dict.fromkeys(_HEELS, math.nan)
+    measures |= body.measure_worst(positions, hips, toes, [motion.skeleton.parents[toe] for toe in toes], fps)
     measures |= _measure_body(positions, hips, find_upper_legs(motion.skeleton), fps)
     if curve is None:
         # Distances of the walk from the line piece between its ends; left is positive.

@@ -6,6 +6,7 @@ means, which hide them: a hand that jumps by half a metre in one frame of two hu
 stand still.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 
@@ -105,6 +106,25 @@ def measure_longest_unsupported(
 
 
 _UNIT = 100.0  # cm
+
+
+def measure_worst(
+    positions: Float[Tensor, "frames joints 3"], hips: int, toes: Sequence[int], ankles: Sequence[int], fps: float
+) -> dict[str, float]:
+    """Measure the worst frames of a motion, which means hide: travel without a step, time without support, depth of a
+    toe under its floor, and the acceleration of any joint (0 for fewer than three frames)."""
+    feet, depth = positions[:, [*toes, *ankles]], contacts.estimate_floor_heights(positions[:, toes])
+    return {
+        "glide_cm": _UNIT * measure_glide(feet, fps),
+        "unsupported_max_s": measure_longest_unsupported(positions[:, toes], positions[:, hips], fps),
+        "depth_max_cm": _UNIT * float((depth - positions[:, toes, 1]).max()),
+        "acceleration_max_m_s2": float(measure_accelerations(positions, fps).amax()) if len(positions) > 2 else 0.0,
+    }
+
+
+def measure_accelerations(positions: Float[Tensor, "frames joints 3"], fps: float) -> Float[Tensor, " inner"]:
+    """Measure the largest acceleration of any joint in each frame but the first and the last, m/s^2."""
+    return positions.diff(n=2, dim=0).norm(dim=-1).amax(dim=1) * fps**2
 
 
 @dataclass(frozen=True)
