@@ -11,11 +11,13 @@ import torch
 
 from mapctl import kinematics, rotations
 from mapctl.errors import MapctlError, RequestError
-from mapctl.formats import sandbox
 from mapctl.formats.parts import (
     CharacterPath,
     FoundCharacter,
     MeshPart,
+    chain_matrices,
+    check_poses,
+    check_size,
     decode_srgb,
     names_file,
     nearest_rotations,
@@ -39,6 +41,8 @@ NEW_NODE = -1
 _DEFAULT_FPS = Fraction(30)
 _UNEVEN_SHARE = 0.02  # of a frame that a key may lie beside it
 _FARTHEST = 1e6  # metres
+_FASTEST_CODES = 240
+"""Time codes per second up to which each is a frame; more are parts of frames."""
 _LARGEST = 1e12  # whatever the unit
 _MAX_VERTICES = 2**23
 _MOST_CARRIERS = 4  # joints of a vertex, as every engine takes them
@@ -103,10 +107,6 @@ class RestFrames:
         offsets = self.positions - self.positions[[max(parent, 0) for parent in self.parents]]
         ends = {self.names[joint]: tuple((tip - self.positions[joint]).tolist()) for joint, tip in tips.items()}
         return Skeleton(self.names, self.parents, torch.from_numpy(offsets), ends)
-
-    def rest_motion(self, skeleton: Skeleton, source: object) -> Motion:
-        """Return one frame of the rest pose."""
-        return self.to_motion(self.matrices()[None], _DEFAULT_FPS, skeleton, source)
 
     def to_motion(self, worlds: Array, fps: Fraction, skeleton: Skeleton, source: object) -> Motion:
         """Return the motion of world matrices (frames, joints, 4, 4) in the file's joint frames."""
@@ -243,8 +243,9 @@ class CharacterSource:
             _stamp_file(chosen.file),
             found.animation,
             found.metres_per_unit,
-            armatures=found.armatures,
-            animations=found.animations,
+            found.humanoid,
+            found.armatures,
+            found.animations,
         )
 
     @property
@@ -289,62 +290,105 @@ def _family(ending: str) -> str:
 
 
 Reader = Callable[..., FoundCharacter]
+"""Reads what is chosen of a file by `armature` and `animation`, and of it what is `wanted`: motion, rest or mesh."""
 
 
-@names_file
-def load_motion(
-    path: str | PathLike[str], read: Reader, read_poses: Callable[[FoundCharacter], tuple[Fraction, Array]]
-) -> Motion:
-    """Read an animation by native code, in a sandbox; one frame of the rest pose where there is none.
+def load_motion(path: str | PathLike[str], read: Reader) -> Motion:
+    """Read an animation; one frame of the rest pose where there is none.
 
-    `read` is called with the file, what the path chooses of it and what is `wanted` (`motion`, `rest` or `mesh`);
-    `read_poses` returns frames per second and world matrices (frames, joints, 4, 4) of the poses that it found.
+    `path` may end as `#ARMATURE`, `#ARMATURE/ANIMATION` or `#/ANIMATION`; by default the file's first animation that
+    moves the armature is read, and a file of several armatures is refused, naming them. Joint frames are aligned with
+    the world in the rest pose. FileFormatError names the fault of the file.
     """
-    found, frames, source = _read_native(path, read, "motion")
-    skeleton = _build_skeleton(found, frames)
-    if found.poses is None:
-        return frames.rest_motion(skeleton, source)
-    fps, worlds = read_poses(found)
-    return frames.to_motion(worlds, fps, skeleton, source)
+    with names_file(path):
+        found, frames, skeleton, source = _read(path, read, "motion")
+        fps, worlds = found.motion or _place_poses(found) or (_DEFAULT_FPS, frames.matrices()[None])
+        return replace(frames.to_motion(worlds, fps, skeleton, source), licence=found.licence)
 
 
-@names_file
 def load_rest(path: str | PathLike[str], read: Reader) -> Motion:
     """Read one frame of the rest pose, as `load_motion` reads an animation."""
-    found, frames, source = _read_native(path, read, "rest")
-    return frames.rest_motion(_build_skeleton(found, frames), source)
+    with names_file(path):
+        _, frames, skeleton, source = _read(path, read, "rest")
+        return frames.to_motion(frames.matrices()[None], _DEFAULT_FPS, skeleton, source)
 
 
-@names_file
 def load_mesh(path: str | PathLike[str], read: Reader) -> CharacterMesh:
-    """Read the triangles in the rest pose, as `load_motion` reads an animation."""
-    found, frames, _ = _read_native(path, read, "mesh")
-    return build_mesh(found.armature, found.parts, frames)
+    """Read the triangles in the rest pose: what the armature's skins carry, and what hangs on its joints rigidly.
+    `path` chooses as in `load_motion`. FileFormatError where the armature has none, or they are broken."""
+    with names_file(path):
+        found, frames, _, _ = _read(path, read, "mesh")
+        meshes = [_build_part(part, frames) for part in found.parts if len(part.faces)]
+        if not meshes:
+            raise Refusal(f"armature {found.armature!r} carries no triangles")
+        return merge_meshes(meshes)
 
 
-def _read_native(
+def _read(
     path: str | PathLike[str], read: Reader, wanted: str
-) -> tuple[FoundCharacter, RestFrames, CharacterSource]:
+) -> tuple[FoundCharacter, RestFrames, Skeleton, CharacterSource]:
     chosen = parse_character_path(path)
     check_ordinary(chosen.file)
-    found = sandbox.call(read, chosen.file, armature=chosen.armature, animation=chosen.animation, wanted=wanted)
+    found = read(chosen.file, armature=chosen.armature, animation=chosen.animation, wanted=wanted)
     if found.fault:
         warn_once(f"{chosen.file}: {found.fault}; its joints and motion are read")
     frames = RestFrames.of(found.names, found.parents, found.worlds, found.outer)
-    return found, frames, CharacterSource.of(chosen, found, frames)
-
-
-def _build_skeleton(found: FoundCharacter, frames: RestFrames) -> Skeleton:
     rests = frames.matrices()
-    return frames.skeleton({joint: (rests[joint] @ np.append(end, 1.0))[:3] for joint, end in found.ends.items()})
+    tips = {joint: (rests[joint] @ end)[:3, -1] for joint, end in found.ends.items()}
+    return found, frames, frames.skeleton(tips), CharacterSource.of(chosen, found, frames)
 
 
-def build_mesh(armature: str, parts: Sequence[MeshPart], frames: RestFrames) -> CharacterMesh:
-    """Build the mesh of all parts in the rest pose. Refusal where there is none, or it is broken."""
-    found = [_build_part(part, frames) for part in parts if len(part.faces)]
-    if not found:
-        raise Refusal(f"armature {armature!r} carries no triangles")
-    return merge_meshes(found)
+def _place_poses(found: FoundCharacter) -> tuple[Fraction, Array] | None:
+    """Return frames per second and world matrices (frames, joints, 4, 4); None where no poses were read."""
+    poses = found.poses
+    if poses is None:
+        return None
+    local, outer = poses.local, poses.outer
+    check_size(outer)
+    fps = frame_rate_of(poses.per_second)
+    if poses.seconds is not None:
+        fps, times = _choose_times(poses.seconds, poses.per_second, len(found.names))
+        local = _interpolate(poses.seconds, local, times)
+        if len(outer) > 1:
+            split = [split_scale(matrix) for matrix in outer]
+            turns = rotations.from_matrix(torch.from_numpy(np.array([turn for turn, _ in split]))).numpy()
+            scales = np.repeat([[scale] for _, scale in split], 3, axis=1)
+            moved = np.concatenate([outer[:, :3, 3], turns, scales], axis=1)[:, None]
+            outer = compose_transforms(_interpolate(poses.seconds, moved, times))[:, 0]
+    for above in np.moveaxis(compose_transforms(poses.above), 1, 0):
+        outer = outer @ above
+    return fps, chain_matrices(found.parents, compose_transforms(local), outer)
+
+
+def _choose_times(seconds: Array, per_second: float, joints: int) -> tuple[Fraction, Array]:
+    """Return frames per second and the frames' times: the time codes, where all samples lie on them. Refusal where
+    there would be too many."""
+    check_poses(int(min(seconds[-1] - seconds[0], 1e15)), joints)
+    codes = seconds * per_second
+    if per_second <= _FASTEST_CODES and np.abs(codes - np.rint(codes)).max() < 1e-4:
+        count = int(min(np.rint(codes[-1]) - np.rint(codes[0]) + 1, 1e15))
+        check_poses(count, joints)
+        return frame_rate_of(per_second), (round(codes[0]) + np.arange(count)) / per_second
+    fps, times = sample_times(seconds)
+    check_poses(len(times), joints)
+    return fps, times
+
+
+def _interpolate(keys: Array, values: Array, times: Array) -> Array:
+    """Return transforms (times, joints, 10) of those at keys (keys, joints, 10): linear, rotations along their arcs."""
+    if len(keys) == len(times) and np.allclose(keys, times, atol=1e-9):
+        return values
+    after = np.searchsorted(keys, times, side="right").clip(1, len(keys) - 1) if len(keys) > 1 else np.zeros(1, int)
+    before = np.maximum(after - 1, 0)
+    gap = keys[after] - keys[before]
+    share = np.where(gap > 0, (times - keys[before]) / np.where(gap > 0, gap, 1.0), 0.0).clip(0.0, 1.0)
+    low, high = values[before], values[after]
+    done = low + (high - low) * share[:, None, None]
+    turns = [torch.from_numpy(np.ascontiguousarray(table[..., 3:7])).reshape(-1, 4) for table in (low, high)]
+    shares = torch.from_numpy(np.repeat(share, values.shape[1]))
+    units = [turn / turn.norm(dim=-1, keepdim=True).clamp_min(1e-12) for turn in turns]
+    done[..., 3:7] = rotations.slerp(units[0], units[1], shares).numpy().reshape(*low.shape[:2], 4)
+    return done
 
 
 def _build_part(part: MeshPart, frames: RestFrames) -> CharacterMesh:
