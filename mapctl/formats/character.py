@@ -18,7 +18,6 @@ from mapctl.formats.parts import (
     chain_matrices,
     check_poses,
     check_size,
-    decode_srgb,
     names_file,
     nearest_rotations,
     parse_character_path,
@@ -29,7 +28,7 @@ from mapctl.formats.sandbox import Refusal
 from mapctl.formats.text import check_ordinary, warn_once
 from mapctl.formats.units import FASTEST, frame_rate
 from mapctl.mesh.character_mesh import CharacterMesh, compute_normals, merge_meshes
-from mapctl.mesh.mannequin import build_skin
+from mapctl.mesh.mannequin import build_skin, place_at_rest
 from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton
 
@@ -413,44 +412,18 @@ def _build_part(part: MeshPart, frames: RestFrames) -> CharacterMesh:
     return CharacterMesh(vertices, normals, part.faces, part.rgba, joints, part.shares, frames.positions)
 
 
-@dataclass(frozen=True, eq=False)
-class SkinnedBody:
-    """A body in its skeleton's rest pose: no joint is turned and the root is at the origin."""
-
-    name: str
-    """Name of the mesh: the mannequin, or a character's own."""
-    rest: Array
-    """(joints, 3) joints, metres."""
-    vertices: Array
-    """(n, 3) metres."""
-    normals: Array
-    """(n, 3) unit."""
-    faces: Array
-    """(m, 3) vertex indices, counter-clockwise seen from outside."""
-    linear_rgb: Array
-    """(n, 3) colours, 0 to 1, in proportion to light as both formats want them."""
-    joints: Array
-    """(n, k) indices of the joints that move a vertex, at most four."""
-    weights: Array
-    """(n, k) their shares; each vertex's add up to 1."""
-
-
-def build_skinned_body(motion: Motion) -> SkinnedBody:
-    """Build the body of a motion: the mesh of the character that it is of, with a colour at every vertex, where that
-    came from a file of another format; else the mannequin."""
-    offsets, rest = motion.skeleton.offsets.numpy(), np.zeros((motion.num_joints, 3))
-    for joint, parent in enumerate(motion.skeleton.parents):
-        rest[joint] = offsets[joint] + rest[parent] if parent >= 0 else 0.0
+def build_skinned_body(motion: Motion) -> tuple[str, CharacterMesh]:
+    """Build the body of a motion, with the root at the origin: the mesh of the character that it is of, with a colour
+    at every vertex and at most four joints that carry it, where that came from a file of another format; else the
+    mannequin. Return its name, too."""
     mesh = _load_own_mesh(motion)
-    if mesh is not None:
-        order = np.argsort(-mesh.weights, axis=1, kind="stable")[:, :_MOST_CARRIERS]
-        joints, weights = (np.take_along_axis(table, order, axis=1) for table in (mesh.joints, mesh.weights))
-        weights /= weights.sum(axis=1, keepdims=True)
-        vertices, rgb = mesh.vertices - mesh.rest[0], decode_srgb(mesh.rgba[:, :3])
-        return SkinnedBody("character", rest, vertices, mesh.normals, mesh.faces, rgb, joints, weights)
-    body = build_skin(motion)
-    vertices, carriers, one = body.vertices + rest[body.joint], body.joint[:, None], np.ones((len(body.joint), 1))
-    return SkinnedBody("mannequin", rest, vertices, body.normals, body.faces, decode_srgb(body.rgb), carriers, one)
+    if mesh is None:
+        return "mannequin", build_skin(motion)
+    order = np.argsort(-mesh.weights, axis=1, kind="stable")[:, :_MOST_CARRIERS]
+    joints, weights = (np.take_along_axis(table, order, axis=1) for table in (mesh.joints, mesh.weights))
+    weights /= weights.sum(axis=1, keepdims=True)
+    vertices, rest = mesh.vertices - mesh.rest[0], place_at_rest(motion.skeleton)
+    return "character", replace(mesh, vertices=vertices, joints=joints, weights=weights, rest=rest)
 
 
 def _load_own_mesh(motion: Motion) -> CharacterMesh | None:

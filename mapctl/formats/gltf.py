@@ -946,20 +946,20 @@ def _build_nodes(motion: Motion) -> list[Json]:
 
 def _add_body(motion: Motion, tree: Json, arrays: _Arrays) -> None:
     """Add the skinned mesh of the motion's body."""
-    joints, body = motion.num_joints, build_skinned_body(motion)
+    joints, (name, body) = motion.num_joints, build_skinned_body(motion)
     missing = ((0, 0), (0, 4 - body.joints.shape[1]))
     weight = np.pad(body.weights, missing).astype(np.float32)
     weight /= weight.sum(axis=1, keepdims=True)
     columns = {
         "POSITION": body.vertices,
         "NORMAL": body.normals,
-        "COLOR_0": body.linear_rgb,
+        "COLOR_0": decode_srgb(body.rgba[:, :3]),
         "JOINTS_0": np.pad(body.joints, missing).astype(np.uint16),
         "WEIGHTS_0": weight,
     }
     attributes = {name: arrays.add(values, _ARRAY_BUFFER) for name, values in columns.items()}
     faces = arrays.add(body.faces.reshape(-1).astype(np.uint32), _ELEMENT_ARRAY_BUFFER)
-    tree["meshes"] = [{"name": body.name, "primitives": [{"attributes": attributes, "indices": faces, "material": 0}]}]
+    tree["meshes"] = [{"name": name, "primitives": [{"attributes": attributes, "indices": faces, "material": 0}]}]
     inverse = np.tile(np.eye(4, dtype=np.float32), (joints, 1, 1))
     inverse[:, 3, :3] = -body.rest  # column-major: the translation is the last row here
     binds = arrays.add(inverse.reshape(joints, 16))

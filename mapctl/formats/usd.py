@@ -34,6 +34,7 @@ from mapctl.formats.parts import (
     check_size,
     complete_bind_pose,
     decode_picture,
+    decode_srgb,
     encode_srgb,
     find_name,
     make_unique,
@@ -48,7 +49,8 @@ from mapctl.formats.sandbox import Refusal
 from mapctl.formats.text import MAX_FILE_BYTES, MAX_POSES
 
 if TYPE_CHECKING:  # the sandbox has no torch
-    from mapctl.formats.character import CharacterSource, SkinnedBody
+    from mapctl.formats.character import CharacterSource
+    from mapctl.mesh.character_mesh import CharacterMesh
     from mapctl.motion import Motion
     from mapctl.skeleton import Skeleton
 
@@ -841,7 +843,7 @@ def _build_stage(motion: "Motion") -> Usd.Stage:
     stage.SetEndTimeCode(motion.num_frames - 1)
     top = UsdSkel.Root.Define(stage, _ROOT)
     stage.SetDefaultPrim(top.GetPrim())
-    body = build_skinned_body(motion)
+    name, body = build_skinned_body(motion)
 
     skeleton = UsdSkel.Skeleton.Define(stage, f"{_ROOT}/skeleton")
     skeleton.CreateJointsAttr(joints)
@@ -868,7 +870,7 @@ def _build_stage(motion: "Motion") -> Usd.Stage:
     _write_samples(animation.CreateRotationsAttr(), Vt.QuatfArray, turns, codes)
     UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
 
-    UsdSkel.BindingAPI.Apply(_define_mesh(stage, body)).CreateSkeletonRel().SetTargets([skeleton.GetPath()])
+    UsdSkel.BindingAPI.Apply(_define_mesh(stage, name, body)).CreateSkeletonRel().SetTargets([skeleton.GetPath()])
     reach = motion.joint_positions().numpy().reshape(-1, 3)  # viewers frame the character by the extent
     corners = reach.min(0) - _MARGIN, reach.max(0) + _MARGIN
     top.CreateExtentAttr([Gf.Vec3f(*corner.tolist()) for corner in corners])
@@ -887,8 +889,8 @@ def joint_paths(skeleton: "Skeleton") -> list[str]:
     return found
 
 
-def _define_mesh(stage: Usd.Stage, body: "SkinnedBody") -> Usd.Prim:
-    mesh = UsdGeom.Mesh.Define(stage, f"{_ROOT}/{body.name}")
+def _define_mesh(stage: Usd.Stage, name: str, body: "CharacterMesh") -> Usd.Prim:
+    mesh = UsdGeom.Mesh.Define(stage, f"{_ROOT}/{name}")
     mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(body.vertices.astype(np.float32)))
     mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(body.faces), 3, np.int32)))
     mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(body.faces.reshape(-1).astype(np.int32)))
@@ -897,7 +899,7 @@ def _define_mesh(stage: Usd.Stage, body: "SkinnedBody") -> Usd.Prim:
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     mesh.CreateExtentAttr([Gf.Vec3f(*corner.tolist()) for corner in (body.vertices.min(0), body.vertices.max(0))])
     colour = mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
-    colour.Set(Vt.Vec3fArray.FromNumpy(body.linear_rgb.astype(np.float32)))
+    colour.Set(Vt.Vec3fArray.FromNumpy(decode_srgb(body.rgba[:, :3]).astype(np.float32)))
     binding, width = UsdSkel.BindingAPI.Apply(mesh.GetPrim()), body.joints.shape[1]
     joints, weights = body.joints.reshape(-1).astype(np.int32), body.weights.reshape(-1).astype(np.float32)
     binding.CreateJointIndicesPrimvar(False, width).Set(Vt.IntArray.FromNumpy(joints))
