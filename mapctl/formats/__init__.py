@@ -38,7 +38,7 @@ _NEEDED = {
 def load(
     path: str | PathLike[str], *, fps: Fraction | float | None = None, metres_per_unit: float | None = None
 ) -> "Motion":
-    """Read a motion from a file of `READERS`, an .amc with the .asf beside it (see `acclaim.load`).
+    """Read a motion from a file of `READERS`, an .amc with the .asf beside it (see `acclaim.read`).
 
     Of a character's file it is an animation, or one frame of the rest pose where there is none; `hero.glb#ARMATURE`,
     `hero.glb#ARMATURE/ANIMATION` and `hero.glb#/ANIMATION` choose where there are several. `fps` is frames per second
@@ -47,26 +47,37 @@ def load(
     FileFormatError names the fault of the file, and where: NaN in place of a number, too, which `load_with_missing`
     takes.
     """
-    reader, file = _find_reader(path), examples.resolve(path)
-    if fps is None:
-        return _finish(reader.load(file), path, metres_per_unit)
-    if (ending := ending_of(path)) != ".amc":
+    reader, ending = _find_reader(path), ending_of(path)
+    if fps is not None and ending != ".amc":
         raise RequestError(f"{path}: a {ending} file has a frame rate of its own; only that of an .amc is requested")
-    return _finish(reader.load(file, fps=fps), path, metres_per_unit)
+    if ending in CHARACTERS:
+        from mapctl.formats import character
+
+        motion = character.load_motion(path, reader.read_character)
+    else:
+        options = {} if fps is None else {"fps": fps}
+        motion, _ = reader.read(examples.resolve(path), lossy=False, **options)
+    return _finish(motion, path, metres_per_unit)
 
 
 def load_rest(path: str | PathLike[str]) -> "Motion | None":
     """Read one frame of a character's rest pose; None for files that have none but their motion."""
-    reader = _find_reader(path)
-    return reader.load_rest(path) if ending_of(path) in CHARACTERS else None
+    reader, ending = _find_reader(path), ending_of(path)
+    if ending not in CHARACTERS:
+        return None
+    from mapctl.formats import character
+
+    return character.load_rest(path, reader.read_character)
 
 
 def load_mesh(path: str | PathLike[str]) -> "CharacterMesh":
     """Read the triangles of a character's file, in its rest pose; FileFormatError where it has none."""
-    reader = _find_reader(path)
-    if ending_of(path) not in CHARACTERS:
+    reader, ending = _find_reader(path), ending_of(path)
+    if ending not in CHARACTERS:
         raise FileFormatError(path, f"is no character's file; those end as {', '.join(CHARACTERS)}")
-    return reader.load_mesh(path)
+    from mapctl.formats import character
+
+    return character.load_mesh(path, reader.read_character)
 
 
 def ending_of(path: str | PathLike[str]) -> str:
@@ -84,7 +95,7 @@ def load_with_missing(
     """
     reader = _find_reader(path)
     if ending_of(path) in _MAY_LACK_VALUES:
-        motion, missing = reader.load_with_missing(examples.resolve(path))
+        motion, missing = reader.read(examples.resolve(path), lossy=True)
         return _finish(motion, path, metres_per_unit), missing
     from mapctl.formats.missing import MissingValues
 

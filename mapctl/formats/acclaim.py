@@ -96,24 +96,15 @@ class AmcText:
     """Frames per second; None where the file does not state them, as most do not."""
 
 
-def load(path: str | PathLike[str], *, fps: Fraction | float | None = None) -> Motion:
+def read(
+    path: str | PathLike[str], *, lossy: bool, fps: Fraction | float | None = None
+) -> tuple[Motion, MissingValues]:
     """Read `take.amc` with the skeleton beside it, or `subject.asf+take.amc`.
 
     Without a name the skeleton is the .asf of the same stem, else the only one in the folder. `fps` is frames per
     second, over those of the file; else `USUAL_FPS`. Lengths are in metres by the ASF's `length`, or where that is 1
-    by the size of the body. FileFormatError names the fault and its line.
+    by the size of the body. Some values of a `lossy` take may be NaN. FileFormatError names the fault and its line.
     """
-    return _read(path, fps=fps, lossy=False)[0]
-
-
-def load_with_missing(
-    path: str | PathLike[str], *, fps: Fraction | float | None = None
-) -> tuple[Motion, MissingValues]:
-    """Read a take in which some values are NaN, and which they are; FileFormatError where all of them are."""
-    return _read(path, fps=fps, lossy=True)
-
-
-def _read(path: str | PathLike[str], *, fps: Fraction | float | None, lossy: bool) -> tuple[Motion, MissingValues]:
     if fps is not None and not SLOWEST <= fps <= FASTEST:
         raise RequestError(f"the frame rate must be {SLOWEST:g} to {FASTEST:g}, got {float(fps):g}")
     try:

@@ -280,7 +280,7 @@ class BvhText:
     """How names are encoded: utf-8 or latin-1."""
 
 
-def read(path: str | PathLike[str], *, lossy: bool = False) -> BvhText:
+def read_text(path: str | PathLike[str], *, lossy: bool = False) -> BvhText:
     """Read a BVH file. FileFormatError names the line and what was expected there.
 
     A `lossy` one may hold NaN among its values, but not only NaN.
@@ -436,25 +436,15 @@ class BvhLayout(FileUnit):
         return 6 if self.metres_per_unit < 0.02 else 8
 
 
-def load(path: str | PathLike[str]) -> Motion:
+def read(path: str | PathLike[str], *, lossy: bool) -> tuple[Motion, MissingValues]:
     """Read a BVH file of any Euler order, with 0 to 6 channels a joint, in any of the units of `units`.
 
-    The root's translation is `root_position` and its offset in the skeleton is zero. Another joint's
-    translation is its offset where it stays still, else `moving_offsets`. FileFormatError names what is
-    wrong, in which line.
+    The root's translation is `root_position` and its offset in the skeleton is zero. Another joint's translation is its
+    offset where it stays still, else `moving_offsets`. Some values of a `lossy` file may be NaN: the position of a
+    joint that stays still is known in every frame if it is in one; if it is in none, it is at OFFSET. FileFormatError
+    names what is wrong, in which line.
     """
-    return _read(read(path))[0]
-
-
-def load_with_missing(path: str | PathLike[str]) -> tuple[Motion, MissingValues]:
-    """Read a BVH file in which some values are NaN, and which they are; FileFormatError where all of them are.
-
-    The position of a joint that stays still is known in every frame if it is in one; if it is in none, it is at OFFSET.
-    """
-    return _read(read(path, lossy=True))
-
-
-def _read(text: BvhText) -> tuple[Motion, MissingValues]:
+    text = read_text(path, lossy=lossy)
     tree, lost = text.hierarchy, np.isnan(text.values)
     values = _fill_missing(tree, text.values)
     _, rest, moving = _classify_translations(tree, values)

@@ -11,12 +11,13 @@ import torch
 
 from mapctl import kinematics, rotations
 from mapctl.errors import MapctlError, RequestError
-from mapctl.formats import sandbox
 from mapctl.formats.parts import (
     CharacterPath,
     FoundCharacter,
     MeshPart,
-    decode_srgb,
+    chain_matrices,
+    check_poses,
+    check_size,
     names_file,
     nearest_rotations,
     parse_character_path,
@@ -27,7 +28,7 @@ from mapctl.formats.sandbox import Refusal
 from mapctl.formats.text import check_ordinary, warn_once
 from mapctl.formats.units import FASTEST, frame_rate
 from mapctl.mesh.character_mesh import CharacterMesh, compute_normals, merge_meshes
-from mapctl.mesh.mannequin import build_skin
+from mapctl.mesh.mannequin import build_skin, place_at_rest
 from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton
 
@@ -39,6 +40,8 @@ NEW_NODE = -1
 _DEFAULT_FPS = Fraction(30)
 _UNEVEN_SHARE = 0.02  # of a frame that a key may lie beside it
 _FARTHEST = 1e6  # metres
+_FASTEST_CODES = 240
+"""Time codes per second up to which each is a frame; more are parts of frames."""
 _LARGEST = 1e12  # whatever the unit
 _MAX_VERTICES = 2**23
 _MOST_CARRIERS = 4  # joints of a vertex, as every engine takes them
@@ -103,10 +106,6 @@ class RestFrames:
         offsets = self.positions - self.positions[[max(parent, 0) for parent in self.parents]]
         ends = {self.names[joint]: tuple((tip - self.positions[joint]).tolist()) for joint, tip in tips.items()}
         return Skeleton(self.names, self.parents, torch.from_numpy(offsets), ends)
-
-    def rest_motion(self, skeleton: Skeleton, source: object) -> Motion:
-        """Return one frame of the rest pose."""
-        return self.to_motion(self.matrices()[None], _DEFAULT_FPS, skeleton, source)
 
     def to_motion(self, worlds: Array, fps: Fraction, skeleton: Skeleton, source: object) -> Motion:
         """Return the motion of world matrices (frames, joints, 4, 4) in the file's joint frames."""
@@ -243,8 +242,9 @@ class CharacterSource:
             _stamp_file(chosen.file),
             found.animation,
             found.metres_per_unit,
-            armatures=found.armatures,
-            animations=found.animations,
+            found.humanoid,
+            found.armatures,
+            found.animations,
         )
 
     @property
@@ -289,62 +289,105 @@ def _family(ending: str) -> str:
 
 
 Reader = Callable[..., FoundCharacter]
+"""Reads what is chosen of a file by `armature` and `animation`, and of it what is `wanted`: motion, rest or mesh."""
 
 
-@names_file
-def load_motion(
-    path: str | PathLike[str], read: Reader, read_poses: Callable[[FoundCharacter], tuple[Fraction, Array]]
-) -> Motion:
-    """Read an animation by native code, in a sandbox; one frame of the rest pose where there is none.
+def load_motion(path: str | PathLike[str], read: Reader) -> Motion:
+    """Read an animation; one frame of the rest pose where there is none.
 
-    `read` is called with the file, what the path chooses of it and what is `wanted` (`motion`, `rest` or `mesh`);
-    `read_poses` returns frames per second and world matrices (frames, joints, 4, 4) of the poses that it found.
+    `path` may end as `#ARMATURE`, `#ARMATURE/ANIMATION` or `#/ANIMATION`; by default the file's first animation that
+    moves the armature is read, and a file of several armatures is refused, naming them. Joint frames are aligned with
+    the world in the rest pose. FileFormatError names the fault of the file.
     """
-    found, frames, source = _read_native(path, read, "motion")
-    skeleton = _build_skeleton(found, frames)
-    if found.poses is None:
-        return frames.rest_motion(skeleton, source)
-    fps, worlds = read_poses(found)
-    return frames.to_motion(worlds, fps, skeleton, source)
+    with names_file(path):
+        found, frames, skeleton, source = _read(path, read, "motion")
+        fps, worlds = found.motion or _place_poses(found) or (_DEFAULT_FPS, frames.matrices()[None])
+        return replace(frames.to_motion(worlds, fps, skeleton, source), licence=found.licence)
 
 
-@names_file
 def load_rest(path: str | PathLike[str], read: Reader) -> Motion:
     """Read one frame of the rest pose, as `load_motion` reads an animation."""
-    found, frames, source = _read_native(path, read, "rest")
-    return frames.rest_motion(_build_skeleton(found, frames), source)
+    with names_file(path):
+        _, frames, skeleton, source = _read(path, read, "rest")
+        return frames.to_motion(frames.matrices()[None], _DEFAULT_FPS, skeleton, source)
 
 
-@names_file
 def load_mesh(path: str | PathLike[str], read: Reader) -> CharacterMesh:
-    """Read the triangles in the rest pose, as `load_motion` reads an animation."""
-    found, frames, _ = _read_native(path, read, "mesh")
-    return build_mesh(found.armature, found.parts, frames)
+    """Read the triangles in the rest pose: what the armature's skins carry, and what hangs on its joints rigidly.
+    `path` chooses as in `load_motion`. FileFormatError where the armature has none, or they are broken."""
+    with names_file(path):
+        found, frames, _, _ = _read(path, read, "mesh")
+        meshes = [_build_part(part, frames) for part in found.parts if len(part.faces)]
+        if not meshes:
+            raise Refusal(f"armature {found.armature!r} carries no triangles")
+        return merge_meshes(meshes)
 
 
-def _read_native(
+def _read(
     path: str | PathLike[str], read: Reader, wanted: str
-) -> tuple[FoundCharacter, RestFrames, CharacterSource]:
+) -> tuple[FoundCharacter, RestFrames, Skeleton, CharacterSource]:
     chosen = parse_character_path(path)
     check_ordinary(chosen.file)
-    found = sandbox.call(read, chosen.file, armature=chosen.armature, animation=chosen.animation, wanted=wanted)
+    found = read(chosen.file, armature=chosen.armature, animation=chosen.animation, wanted=wanted)
     if found.fault:
         warn_once(f"{chosen.file}: {found.fault}; its joints and motion are read")
     frames = RestFrames.of(found.names, found.parents, found.worlds, found.outer)
-    return found, frames, CharacterSource.of(chosen, found, frames)
-
-
-def _build_skeleton(found: FoundCharacter, frames: RestFrames) -> Skeleton:
     rests = frames.matrices()
-    return frames.skeleton({joint: (rests[joint] @ np.append(end, 1.0))[:3] for joint, end in found.ends.items()})
+    tips = {joint: (rests[joint] @ end)[:3, -1] for joint, end in found.ends.items()}
+    return found, frames, frames.skeleton(tips), CharacterSource.of(chosen, found, frames)
 
 
-def build_mesh(armature: str, parts: Sequence[MeshPart], frames: RestFrames) -> CharacterMesh:
-    """Build the mesh of all parts in the rest pose. Refusal where there is none, or it is broken."""
-    found = [_build_part(part, frames) for part in parts if len(part.faces)]
-    if not found:
-        raise Refusal(f"armature {armature!r} carries no triangles")
-    return merge_meshes(found)
+def _place_poses(found: FoundCharacter) -> tuple[Fraction, Array] | None:
+    """Return frames per second and world matrices (frames, joints, 4, 4); None where no poses were read."""
+    poses = found.poses
+    if poses is None:
+        return None
+    local, outer = poses.local, poses.outer
+    check_size(outer)
+    fps = frame_rate_of(poses.per_second)
+    if poses.seconds is not None:
+        fps, times = _choose_times(poses.seconds, poses.per_second, len(found.names))
+        local = _interpolate(poses.seconds, local, times)
+        if len(outer) > 1:
+            split = [split_scale(matrix) for matrix in outer]
+            turns = rotations.from_matrix(torch.from_numpy(np.array([turn for turn, _ in split]))).numpy()
+            scales = np.repeat([[scale] for _, scale in split], 3, axis=1)
+            moved = np.concatenate([outer[:, :3, 3], turns, scales], axis=1)[:, None]
+            outer = compose_transforms(_interpolate(poses.seconds, moved, times))[:, 0]
+    for above in np.moveaxis(compose_transforms(poses.above), 1, 0):
+        outer = outer @ above
+    return fps, chain_matrices(found.parents, compose_transforms(local), outer)
+
+
+def _choose_times(seconds: Array, per_second: float, joints: int) -> tuple[Fraction, Array]:
+    """Return frames per second and the frames' times: the time codes, where all samples lie on them. Refusal where
+    there would be too many."""
+    check_poses(int(min(seconds[-1] - seconds[0], 1e15)), joints)
+    codes = seconds * per_second
+    if per_second <= _FASTEST_CODES and np.abs(codes - np.rint(codes)).max() < 1e-4:
+        count = int(min(np.rint(codes[-1]) - np.rint(codes[0]) + 1, 1e15))
+        check_poses(count, joints)
+        return frame_rate_of(per_second), (round(codes[0]) + np.arange(count)) / per_second
+    fps, times = sample_times(seconds)
+    check_poses(len(times), joints)
+    return fps, times
+
+
+def _interpolate(keys: Array, values: Array, times: Array) -> Array:
+    """Return transforms (times, joints, 10) of those at keys (keys, joints, 10): linear, rotations along their arcs."""
+    if len(keys) == len(times) and np.allclose(keys, times, atol=1e-9):
+        return values
+    after = np.searchsorted(keys, times, side="right").clip(1, len(keys) - 1) if len(keys) > 1 else np.zeros(1, int)
+    before = np.maximum(after - 1, 0)
+    gap = keys[after] - keys[before]
+    share = np.where(gap > 0, (times - keys[before]) / np.where(gap > 0, gap, 1.0), 0.0).clip(0.0, 1.0)
+    low, high = values[before], values[after]
+    done = low + (high - low) * share[:, None, None]
+    turns = [torch.from_numpy(np.ascontiguousarray(table[..., 3:7])).reshape(-1, 4) for table in (low, high)]
+    shares = torch.from_numpy(np.repeat(share, values.shape[1]))
+    units = [turn / turn.norm(dim=-1, keepdim=True).clamp_min(1e-12) for turn in turns]
+    done[..., 3:7] = rotations.slerp(units[0], units[1], shares).numpy().reshape(*low.shape[:2], 4)
+    return done
 
 
 def _build_part(part: MeshPart, frames: RestFrames) -> CharacterMesh:
@@ -369,44 +412,18 @@ def _build_part(part: MeshPart, frames: RestFrames) -> CharacterMesh:
     return CharacterMesh(vertices, normals, part.faces, part.rgba, joints, part.shares, frames.positions)
 
 
-@dataclass(frozen=True, eq=False)
-class SkinnedBody:
-    """A body in its skeleton's rest pose: no joint is turned and the root is at the origin."""
-
-    name: str
-    """Name of the mesh: the mannequin, or a character's own."""
-    rest: Array
-    """(joints, 3) joints, metres."""
-    vertices: Array
-    """(n, 3) metres."""
-    normals: Array
-    """(n, 3) unit."""
-    faces: Array
-    """(m, 3) vertex indices, counter-clockwise seen from outside."""
-    linear_rgb: Array
-    """(n, 3) colours, 0 to 1, in proportion to light as both formats want them."""
-    joints: Array
-    """(n, k) indices of the joints that move a vertex, at most four."""
-    weights: Array
-    """(n, k) their shares; each vertex's add up to 1."""
-
-
-def build_skinned_body(motion: Motion) -> SkinnedBody:
-    """Build the body of a motion: the mesh of the character that it is of, with a colour at every vertex, where that
-    came from a file of another format; else the mannequin."""
-    offsets, rest = motion.skeleton.offsets.numpy(), np.zeros((motion.num_joints, 3))
-    for joint, parent in enumerate(motion.skeleton.parents):
-        rest[joint] = offsets[joint] + rest[parent] if parent >= 0 else 0.0
+def build_skinned_body(motion: Motion) -> tuple[str, CharacterMesh]:
+    """Build the body of a motion, with the root at the origin: the mesh of the character that it is of, with a colour
+    at every vertex and at most four joints that carry it, where that came from a file of another format; else the
+    mannequin. Return its name, too."""
     mesh = _load_own_mesh(motion)
-    if mesh is not None:
-        order = np.argsort(-mesh.weights, axis=1, kind="stable")[:, :_MOST_CARRIERS]
-        joints, weights = (np.take_along_axis(table, order, axis=1) for table in (mesh.joints, mesh.weights))
-        weights /= weights.sum(axis=1, keepdims=True)
-        vertices, rgb = mesh.vertices - mesh.rest[0], decode_srgb(mesh.rgba[:, :3])
-        return SkinnedBody("character", rest, vertices, mesh.normals, mesh.faces, rgb, joints, weights)
-    body = build_skin(motion)
-    vertices, carriers, one = body.vertices + rest[body.joint], body.joint[:, None], np.ones((len(body.joint), 1))
-    return SkinnedBody("mannequin", rest, vertices, body.normals, body.faces, decode_srgb(body.rgb), carriers, one)
+    if mesh is None:
+        return "mannequin", build_skin(motion)
+    order = np.argsort(-mesh.weights, axis=1, kind="stable")[:, :_MOST_CARRIERS]
+    joints, weights = (np.take_along_axis(table, order, axis=1) for table in (mesh.joints, mesh.weights))
+    weights /= weights.sum(axis=1, keepdims=True)
+    vertices, rest = mesh.vertices - mesh.rest[0], place_at_rest(motion.skeleton)
+    return "character", replace(mesh, vertices=vertices, joints=joints, weights=weights, rest=rest)
 
 
 def _load_own_mesh(motion: Motion) -> CharacterMesh | None:

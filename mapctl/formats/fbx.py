@@ -1,25 +1,25 @@
 """FBX in, by the package ufbx: characters and captures, as rigs and as clips. FBX is not written.
 
-`read_character` and all below it run in `mapctl.formats.sandbox`, without torch.
+`find_character` and all below it run in `mapctl.formats.sandbox`, without torch.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from fractions import Fraction
-from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import ufbx
 
+from mapctl.formats import sandbox
 from mapctl.formats.parts import (
     GREY,
     MAX_CORNERS,
     MAX_JOINTS,
     FoundCharacter,
     MeshPart,
-    chain_matrices,
+    Poses,
+    check_poses,
     check_size,
     complete_bind_pose,
     decode_picture,
@@ -33,11 +33,6 @@ from mapctl.formats.parts import (
     strongest,
 )
 from mapctl.formats.sandbox import Refusal
-from mapctl.formats.text import MAX_POSES
-
-if TYPE_CHECKING:
-    from mapctl.mesh.character_mesh import CharacterMesh
-    from mapctl.motion import Motion
 
 Array = np.ndarray
 NEWEST, OLDEST = 7799, 3000
@@ -51,57 +46,12 @@ _MOVED = ("Lcl Translation", "Lcl Rotation", "Lcl Scaling")
 _kept: list[object] = []
 
 
-def load(path: str | PathLike[str]) -> "Motion":
-    """Read an animation of an .fbx file; one frame of the rest pose where it has none.
-
-    `path` may end as `#ARMATURE`, `#ARMATURE/ANIMATION` or `#/ANIMATION`; by default the file's first animation that
-    moves the armature is read, and a file of several armatures is refused, naming them. Joint frames are aligned with
-    the world in the rest pose. FileFormatError names the fault of the file.
-    """
-    from mapctl.formats import character
-
-    return character.load_motion(path, read_character, _place_poses)
+def read_character(path: Path, **choice: str | None) -> FoundCharacter:
+    """Read a character in a sandbox: see `find_character`."""
+    return sandbox.call(find_character, path, **choice)
 
 
-def load_rest(path: str | PathLike[str]) -> "Motion":
-    """Read one frame of the rest pose, as `load` reads an animation."""
-    from mapctl.formats import character
-
-    return character.load_rest(path, read_character)
-
-
-def load_mesh(path: str | PathLike[str]) -> "CharacterMesh":
-    """Read the mesh of a character: what its skins carry, and what hangs on its joints rigidly. `path` chooses as in
-    `load`. FileFormatError where the file has no triangles for the armature, or they are broken."""
-    from mapctl.formats import character
-
-    return character.load_mesh(path, read_character)
-
-
-@dataclass(frozen=True, eq=False)
-class Take:
-    """Poses of an armature at the frames of one rate."""
-
-    rate: float
-    """Frames per second of the file."""
-    local: Array
-    """(frames, joints, 10) of each joint in its parent's frame: translation, rotation xyzw, scale."""
-    above: Array
-    """(frames or 1, nodes above the root, 10) likewise, the outermost first."""
-
-
-def _place_poses(found: FoundCharacter) -> tuple[Fraction, Array]:
-    """Return frames per second and world matrices (frames, joints, 4, 4)."""
-    from mapctl.formats.character import compose_transforms, frame_rate_of
-
-    outer = np.eye(4) + np.zeros((1, 4, 4))
-    for one in np.moveaxis(compose_transforms(found.poses.above), 1, 0):
-        outer = outer @ one
-    worlds = chain_matrices(found.parents, compose_transforms(found.poses.local), outer)
-    return frame_rate_of(found.poses.rate), worlds
-
-
-def read_character(path: str, *, armature: str | None, animation: str | None, wanted: str) -> FoundCharacter:
+def find_character(path: str, *, armature: str | None, animation: str | None, wanted: str) -> FoundCharacter:
     """Read an armature, and `wanted` besides: `rest` nothing, `motion` its animation, `mesh` its triangles. Refusal
     gives the reason.
 
@@ -125,7 +75,7 @@ def read_character(path: str, *, armature: str | None, animation: str | None, wa
         metres_per_unit=scene.settings.original_unit_meters,
         worlds=next((pose for pose in complete if pose is not None), worlds),
         outer=np.eye(4) if root.is_root else to_matrix(above(root).node_to_world),
-        ends={joint: to_matrix(node.node_to_parent)[:3, 3] for joint, node in own.ends.items()},
+        ends={joint: to_matrix(node.node_to_parent)[:, 3:] for joint, node in own.ends.items()},
         fault=fault,
     )
     if wanted == "motion":
@@ -361,23 +311,22 @@ def _moved_nodes(stack: ufbx.AnimStack) -> set[int]:
     }
 
 
-def _sample(scene: ufbx.Scene, name: str, stack: ufbx.AnimStack, begin: float, end: float, armature: Armature) -> Take:
+def _sample(scene: ufbx.Scene, name: str, stack: ufbx.AnimStack, begin: float, end: float, armature: Armature) -> Poses:
     outer = line_of(armature.nodes[0])[:0:-1]
     rate = scene.settings.frames_per_second
     rate = rate if np.isfinite(rate) and 0.01 <= rate <= 1e5 else _USUAL_RATE
     if not (np.isfinite(begin) and np.isfinite(end)) or end < begin:
         raise Refusal(f"animation {name!r} lasts from {begin:g} to {end:g} s")
     count = np.floor((end - begin) * rate + _EARLY_SHARE) + 1
-    joints = len(armature.nodes) + len(outer)
-    if count * joints > MAX_POSES:
-        raise Refusal(f"{count:.0f} frames of {joints} joints, allowed are {MAX_POSES} in all")
+    check_poses(count, len(armature.nodes) + len(outer))
     times = begin + np.arange(int(count)) / rate
     moved = _moved_nodes(stack)
     local = np.stack([_sample_node(stack.anim, node, times, moved) for node in armature.nodes], axis=1)
     above = np.zeros((1, 0, 10))
     if outer:
         above = np.stack([_sample_node(stack.anim, node, times, moved) for node in outer], axis=1)
-    return Take(rate, local, above if {node.element_id for node in outer} & moved else above[:1])
+    is_moved = bool({node.element_id for node in outer} & moved)
+    return Poses(rate, None, local, np.eye(4)[None], above if is_moved else above[:1])
 
 
 def _find_range(stack: ufbx.AnimStack, own: set[int]) -> tuple[float, float]:

@@ -10,17 +10,16 @@ hips travel, no node is scaled, and eyes are none of the bones.
 
 import base64
 import copy
-import functools
 import json
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
 from os import PathLike
 from pathlib import Path, PurePath
-from typing import Any, ParamSpec, TypeVar
+from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
@@ -30,21 +29,13 @@ from mapctl import kinematics, rotations
 from mapctl.errors import RequestError
 from mapctl.formats.atomic import write_pieces
 from mapctl.formats.bvh import check_finite
-from mapctl.formats.character import (
-    CharacterSource,
-    RestFrames,
-    build_mesh,
-    build_skinned_body,
-    character_of,
-    compose_matrices,
-    sample_times,
-)
+from mapctl.formats.character import CharacterSource, build_skinned_body, character_of, compose_matrices, sample_times
 from mapctl.formats.parts import (
     MAX_JOINTS,
-    CharacterPath,
     FoundCharacter,
     MeshPart,
     chain_matrices,
+    check_poses,
     complete_bind_pose,
     decode_picture,
     decode_srgb,
@@ -52,14 +43,12 @@ from mapctl.formats.parts import (
     find_name,
     make_unique,
     names_file,
-    parse_character_path,
     sample_picture,
     share_out,
     split_scale,
 )
 from mapctl.formats.sandbox import Refusal
-from mapctl.formats.text import MAX_FILE_BYTES, check_extent, check_ordinary, one_line, read_bytes, shorten, warn_once
-from mapctl.mesh.character_mesh import CharacterMesh
+from mapctl.formats.text import MAX_FILE_BYTES, check_ordinary, one_line, read_bytes, shorten, warn_once
 from mapctl.motion import Motion
 from mapctl.rotations import make_sign_continuous
 from mapctl.skeleton import CANONICAL, Skeleton
@@ -90,69 +79,77 @@ _THUMBS = {"ThumbProximal": "ThumbMetacarpal", "ThumbIntermediate": "ThumbProxim
 """Bones of VRM 0 that have another name in VRM 1."""
 _HALF_TURN = torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=torch.float64)
 
-P = ParamSpec("P")
-T = TypeVar("T")
+
+@contextmanager
+def _refuse_malformed() -> Iterator[None]:
+    """Raise Refusal where a document has other entries than glTF's."""
+    try:
+        yield
+    except _MALFORMED as error:
+        raise Refusal(f"is no sound glTF file: {type(error).__name__}: {one_line(error)}") from error
 
 
-def _refuse_malformed(read: Callable[P, T]) -> Callable[P, T]:
-    """Have FileFormatError raised for a Refusal, and where a document has other entries than glTF's."""
+@_refuse_malformed()
+def read_character(path: Path, *, armature: str | None, animation: str | None, wanted: str) -> FoundCharacter:
+    """Read an armature, and `wanted` besides: `rest` nothing, `motion` its animation, `mesh` its triangles. Refusal
+    gives the reason.
 
-    @names_file
-    @functools.wraps(read)
-    def done(*words: P.args, **options: P.kwargs) -> T:
-        try:
-            return read(*words, **options)
-        except _MALFORMED as error:
-            raise Refusal(f"is no sound glTF file: {type(error).__name__}: {one_line(error)}") from error
-
-    return done
-
-
-@_refuse_malformed
-def load(path: str | PathLike[str]) -> Motion:
-    """Read an animation of a character from a .glb, .gltf, .vrm or .vrma file; one frame of its rest pose where it has
-    none.
-
-    `path` may end as `#ARMATURE`, `#ARMATURE/ANIMATION` or `#/ANIMATION`; by default the file's first animation that
-    moves the armature is read, and a file of several armatures is refused, naming them. Joint frames are aligned with
-    the world in the rest pose. FileFormatError names the fault of the file.
+    The rest pose is the one in which the skins are bound where all of them hold one and bones are as long as the
+    nodes' (VRM files: always the nodes'); else the nodes'.
     """
-    chosen, gltf, armature, found = _open_character(path)
-    names, wanted = _name_animations(gltf), range(len(gltf.all("animations")))
-    if chosen.animation is not None:
-        wanted = [find_name("", names, chosen.animation, "animation")]
-    read = ((names[number], _read_tracks(gltf, number, armature.nodes)) for number in wanted)
+    gltf = read_file(path)
+    armatures = find_armatures(gltf)
+    listed = [one.name for one in armatures]
+    own = armatures[find_name(path.name, listed, armature, "armature")]
+    nodes = [gltf.get("nodes", node) for node in own.nodes]
+    outer = gltf.chain(gltf.line(own.nodes[0])[1:])
+    worlds = chain_matrices(own.parents, np.stack([_node_matrix(node) for node in nodes]), outer)
+    is_vrm = any(name in gltf.tree.get("extensions", {}) for name in ("VRM", *_EXTENSIONS))  # whatever its ending
+    bound = None if is_vrm else _bind_worlds(gltf, own, worlds, outer)
+    names = make_unique([str(n.get("name") or f"node_{k}") for n, k in zip(nodes, own.nodes, strict=True)])
+    found = FoundCharacter(
+        armature=own.name,
+        armatures=listed,
+        names=names,
+        nodes=own.nodes,
+        parents=own.parents,
+        metres_per_unit=1.0,
+        worlds=worlds if bound is None else bound,
+        outer=outer,
+        ends={joint: _node_matrix(gltf.get("nodes", node)) for joint, node in own.ends.items()},
+        humanoid=_name_bones(gltf, dict(zip(own.nodes, names, strict=True))),
+    )
+    if wanted == "motion":
+        _read_motion(gltf, own, animation, found)
+    if wanted == "mesh":
+        found.parts = list(_read_parts(gltf, own))
+    return found
+
+
+def _name_bones(gltf: "Gltf", names: Mapping[int, str]) -> dict[str, str]:
+    """Return the joint by canonical name, of those whose `names` are given by node."""
+    bones = {bone: names[node] for bone, node in read_bones(gltf).items() if node in names}
+    if "upperChest" in bones:  # it carries the arms, and is the canonical chest where a file has one
+        bones["chest"] = bones["upperChest"]
+    return {bone: name for bone, name in bones.items() if bone in CANONICAL.names}
+
+
+def _read_motion(gltf: "Gltf", armature: "Armature", wanted: str | None, found: FoundCharacter) -> None:
+    """Add the wanted animation, else the first that moves the armature, to what was found."""
+    names = _name_animations(gltf)
+    numbers = range(len(names)) if wanted is None else [find_name("", names, wanted, "animation")]
+    read = ((names[number], _read_tracks(gltf, number, armature.nodes)) for number in numbers)
     name, tracks = next((own for own in read if own[1]), (None, []))
-    if chosen.animation is not None and name is None:
-        raise Refusal(f"animation {chosen.animation!r} does not move {armature.name!r}")
-    if name is not None:
-        found.animation, found.animations = name, _time_animations(gltf, armature.nodes)
-    frames, skeleton, source = _describe(chosen, gltf, armature, found)
     if name is None:
-        return frames.rest_motion(skeleton, source)
+        if wanted is not None:
+            raise Refusal(f"animation {wanted!r} does not move {armature.name!r}")
+        return
+    found.animation, found.animations = name, _time_animations(gltf, armature.nodes)
     fps, local = _sample_tracks(gltf, armature.nodes, tracks)
-    worlds = chain_matrices(armature.parents, local, frames.outer)
+    found.motion = fps, chain_matrices(armature.parents, local, found.outer)
     extras = gltf.tree["asset"].get("extras")
     licence = extras.get(LICENCE) if isinstance(extras, dict) else None
-    motion = frames.to_motion(worlds, fps, skeleton, source)
-    return replace(motion, licence=licence if isinstance(licence, str) else "")
-
-
-@_refuse_malformed
-def load_rest(path: str | PathLike[str]) -> Motion:
-    """Read one frame of a character's rest pose, as `load` reads its animation."""
-    chosen, gltf, armature, found = _open_character(path)
-    frames, skeleton, source = _describe(chosen, gltf, armature, found)
-    return frames.rest_motion(skeleton, source)
-
-
-@_refuse_malformed
-def load_mesh(path: str | PathLike[str]) -> CharacterMesh:
-    """Read the mesh of a character: what its skins carry, and what hangs on its joints rigidly. `path` chooses as in
-    `load`. FileFormatError where the file has no triangles for the armature, or they are broken."""
-    _, gltf, armature, found = _open_character(path)
-    frames = RestFrames.of(found.names, found.parents, found.worlds, found.outer)
-    return build_mesh(armature.name, list(_read_parts(gltf, armature)), frames)
+    found.licence = licence if isinstance(licence, str) else ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -389,47 +386,6 @@ class Armature:
     """Node that is the End Site of a last joint, by that joint's index among `nodes`."""
 
 
-def _open_character(path: str | PathLike[str]) -> tuple[CharacterPath, Gltf, Armature, FoundCharacter]:
-    """Read a file, choose its armature and find its rest pose: the one in which the skins are bound where all of them
-    hold one and bones are as long as the nodes' (VRM files: always the nodes'); else the nodes'."""
-    chosen = parse_character_path(path)
-    gltf = read_file(chosen.file)
-    armatures = find_armatures(gltf)
-    listed = [armature.name for armature in armatures]
-    armature = armatures[find_name(chosen.file.name, listed, chosen.armature, "armature")]
-    nodes = [gltf.get("nodes", node) for node in armature.nodes]
-    outer = gltf.chain(gltf.line(armature.nodes[0])[1:])
-    worlds = chain_matrices(armature.parents, np.stack([_node_matrix(node) for node in nodes]), outer)
-    is_vrm = any(name in gltf.tree.get("extensions", {}) for name in ("VRM", *_EXTENSIONS))  # whatever its ending
-    bound = None if is_vrm else _bind_worlds(gltf, armature, worlds, outer)
-    found = FoundCharacter(
-        armature=armature.name,
-        armatures=listed,
-        names=make_unique([str(n.get("name") or f"node_{k}") for n, k in zip(nodes, armature.nodes, strict=True)]),
-        nodes=armature.nodes,
-        parents=armature.parents,
-        metres_per_unit=1.0,
-        worlds=worlds if bound is None else bound,
-        outer=outer,
-    )
-    return chosen, gltf, armature, found
-
-
-def _describe(
-    chosen: CharacterPath, gltf: Gltf, armature: Armature, found: FoundCharacter
-) -> tuple[RestFrames, Skeleton, CharacterSource]:
-    frames = RestFrames.of(found.names, found.parents, found.worlds, found.outer)
-    at = dict(zip(found.nodes, frames.names, strict=True))
-    bones = {bone: at[node] for bone, node in read_bones(gltf).items() if node in at}
-    if "upperChest" in bones:  # it carries the arms, and is the canonical chest where a file has one
-        bones["chest"] = bones["upperChest"]
-    humanoid = {bone: name for bone, name in bones.items() if bone in CANONICAL.names}
-    rests = frames.matrices()
-    ends = {joint: rests[joint] @ _node_matrix(gltf.get("nodes", node)) for joint, node in armature.ends.items()}
-    skeleton = frames.skeleton({joint: end[:3, 3] for joint, end in ends.items()})
-    return frames, skeleton, replace(CharacterSource.of(chosen, found, frames), humanoid=humanoid)
-
-
 def _bind_worlds(gltf: Gltf, armature: Armature, worlds: Array, outer: Array) -> Array | None:
     """Return world matrices (joints, 4, 4) of the pose in which the skins are bound, as far as they agree with the
     nodes' bones; None where they do not, or are not said.
@@ -646,12 +602,12 @@ def _read_track(gltf: Gltf, node: int, path: str, sampler: Json, what: str) -> T
 def _sample_tracks(gltf: Gltf, nodes: Sequence[int], tracks: Sequence[Track]) -> tuple[Fraction, Array]:
     """Return frames per second, and local matrices (frames, nodes, 4, 4) at its frames, from the first key to the last.
 
-    FileFormatError where there would be too many.
+    Refusal where there would be too many.
     """
     keys = np.concatenate([track.times for track in tracks])
-    check_extent(gltf.path, int(keys.max() - keys.min()), 1)
+    check_poses(int(keys.max() - keys.min()), 1)
     fps, times = sample_times(keys)
-    check_extent(gltf.path, len(times), len(nodes))
+    check_poses(len(times), len(nodes))
     moved = {track.node for track in tracks}
     matrices = np.empty((len(times), len(nodes), 4, 4))
     for number, node in enumerate(nodes):
@@ -787,7 +743,8 @@ def _save_character(motion: Motion, path: str | PathLike[str], source: Character
     RequestError where the character's file has changed since it was read.
     """
     source.check_unchanged()
-    gltf, tree, binary = _gather(source.path)
+    with names_file(source.path), _refuse_malformed():
+        gltf, tree, binary = _gather(source.path)
     appended = _Arrays(tree, sum(len(piece) for piece in binary))
     nodes = [int(node) for node in source.nodes]
     if source.has_new_root:
@@ -808,7 +765,6 @@ def _save_character(motion: Motion, path: str | PathLike[str], source: Character
     write_pieces(path, _compose_glb(tree, [*binary, *appended.pieces]))
 
 
-@_refuse_malformed
 def _gather(path: Path) -> tuple[Gltf, Json, list[bytes]]:
     """Read a file; also return a copy of the document with one buffer, and that buffer's pieces: other files are put
     into it."""
@@ -990,20 +946,20 @@ def _build_nodes(motion: Motion) -> list[Json]:
 
 def _add_body(motion: Motion, tree: Json, arrays: _Arrays) -> None:
     """Add the skinned mesh of the motion's body."""
-    joints, body = motion.num_joints, build_skinned_body(motion)
+    joints, (name, body) = motion.num_joints, build_skinned_body(motion)
     missing = ((0, 0), (0, 4 - body.joints.shape[1]))
     weight = np.pad(body.weights, missing).astype(np.float32)
     weight /= weight.sum(axis=1, keepdims=True)
     columns = {
         "POSITION": body.vertices,
         "NORMAL": body.normals,
-        "COLOR_0": body.linear_rgb,
+        "COLOR_0": decode_srgb(body.rgba[:, :3]),
         "JOINTS_0": np.pad(body.joints, missing).astype(np.uint16),
         "WEIGHTS_0": weight,
     }
     attributes = {name: arrays.add(values, _ARRAY_BUFFER) for name, values in columns.items()}
     faces = arrays.add(body.faces.reshape(-1).astype(np.uint32), _ELEMENT_ARRAY_BUFFER)
-    tree["meshes"] = [{"name": body.name, "primitives": [{"attributes": attributes, "indices": faces, "material": 0}]}]
+    tree["meshes"] = [{"name": name, "primitives": [{"attributes": attributes, "indices": faces, "material": 0}]}]
     inverse = np.tile(np.eye(4, dtype=np.float32), (joints, 1, 1))
     inverse[:, 3, :3] = -body.rest  # column-major: the translation is the last row here
     binds = arrays.add(inverse.reshape(joints, 16))

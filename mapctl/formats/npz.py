@@ -56,17 +56,9 @@ _TRACKS = ("root_position_world", "local_quat_xyzw", "moving_offsets")
 """Keys that change from frame to frame, and may hold NaN where a lossy reading is requested."""
 
 
-def load(path: str | PathLike[str]) -> Motion:
-    """Read what `save` wrote. FileFormatError names the key that is missing or wrong."""
-    return _read(path, lossy=False)[0]
-
-
-def load_with_missing(path: str | PathLike[str]) -> tuple[Motion, MissingValues]:
-    """Read an archive with rotations and positions that are NaN, and which they are; FileFormatError where all are."""
-    return _read(path, lossy=True)
-
-
-def _read(path: str | PathLike[str], *, lossy: bool) -> tuple[Motion, MissingValues]:
+def read(path: str | PathLike[str], *, lossy: bool) -> tuple[Motion, MissingValues]:
+    """Read what `save` wrote. FileFormatError names the key that is missing or wrong. Some rotations and positions of a
+    `lossy` archive may be NaN."""
     arrays = _read_arrays(path, read_bytes(path))
     _check_shapes(path, arrays, lossy=lossy)
     lost = _replace_missing(path, arrays)

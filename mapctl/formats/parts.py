@@ -3,23 +3,22 @@
 What is wrong with a file is a `Refusal`, which `names_file` and `sandbox.call` turn into FileFormatError.
 """
 
-import functools
 import io
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from fractions import Fraction
 from os import PathLike
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
 from mapctl.errors import FileFormatError
 from mapctl.formats.sandbox import Refusal
+from mapctl.formats.text import MAX_POSES
 
 Array = np.ndarray
-P = ParamSpec("P")
-T = TypeVar("T")
 MAX_JOINTS = 4096
 """Most joints of an armature."""
 MAX_CORNERS = 2**25
@@ -56,18 +55,13 @@ def parse_character_path(path: str | PathLike[str]) -> CharacterPath:
     return CharacterPath(Path(name), armature or None, animation or None)
 
 
-def names_file(read: Callable[P, T]) -> Callable[P, T]:
-    """Have a reader, whose first argument is a path, raise FileFormatError for a Refusal."""
-
-    @functools.wraps(read)
-    def done(*words: P.args, **options: P.kwargs) -> T:
-        try:
-            return read(*words, **options)
-        except Refusal as refusal:
-            assert isinstance(words[0], str | PathLike)
-            raise FileFormatError(parse_character_path(words[0]).file, refusal.args[0]) from None
-
-    return done
+@contextmanager
+def names_file(path: str | PathLike[str]) -> Iterator[None]:
+    """Raise FileFormatError, which names the file of a `path`, for a Refusal within."""
+    try:
+        yield
+    except Refusal as refusal:
+        raise FileFormatError(parse_character_path(path).file, refusal.args[0]) from None
 
 
 def make_unique(names: Sequence[str]) -> list[str]:
@@ -116,6 +110,22 @@ class MeshPart:
     """(n, k) how much; each vertex's add up to 1."""
 
 
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Poses of a character at its keys; transforms (..., 10) are translation, rotation xyzw and scale."""
+
+    per_second: float
+    """Frames, or time codes, per second."""
+    seconds: Array | None
+    """(keys,) times; None where there is a key in every frame."""
+    local: Array
+    """(keys, joints, 10) of each joint in its parent's frame."""
+    outer: Array
+    """(keys or 1, 4, 4) what takes the frame that the outermost of `above` is in to the world."""
+    above: Array = field(default_factory=lambda: np.zeros((1, 0, 10)))
+    """(keys or 1, nodes, 10) of what is above the root, the outermost first."""
+
+
 @dataclass(eq=False, kw_only=True)
 class FoundCharacter:
     """A character's joints in a file, and what was read of them. The world is in metres, with Y up."""
@@ -137,15 +147,21 @@ class FoundCharacter:
     outer: Array
     """(4, 4) what takes the frame that the root is in to the world."""
     ends: dict[int, Array] = field(default_factory=dict)
-    """(3,) tip of a last joint in its frame, by joint."""
+    """(4, n) whose last column is the tip of a last joint in its frame, by joint."""
+    humanoid: dict[str, str] = field(default_factory=dict)
+    """Joint by canonical name, where the file itself maps them (VRM)."""
+    licence: str = ""
+    """Licence of the motion that was read."""
     fault: str = ""
     """Fault of the meshes; empty without one."""
     animations: dict[str, float] = field(default_factory=dict)
     """Seconds by name of the animations that fit the character; empty unless its motion was read."""
     animation: str | None = None
     """Name of the animation that was read."""
-    poses: Any = None
-    """Its poses, as the format has them."""
+    poses: Poses | None = None
+    """Its poses at its keys, or else `motion`."""
+    motion: tuple[Fraction, Array] | None = None
+    """Frames per second, and world matrices (frames, joints, 4, 4)."""
     parts: list[MeshPart] = field(default_factory=list)
     """Its triangles; empty unless they were read."""
 
@@ -159,6 +175,12 @@ def check_size(*tables: Array) -> None:
     for table in tables:
         if not np.isfinite(table).all() or np.abs(table).max(initial=0.0) > _FARTHEST:
             raise Refusal("its joints are at positions that are not finite, or larger than 1000 km")
+
+
+def check_poses(frames: float, joints: int) -> None:
+    """Refuse so many frames and joints where their poses would fill the memory."""
+    if frames * joints > MAX_POSES:
+        raise Refusal(f"{frames:.0f} frames of {joints} joints, allowed are {MAX_POSES} in all")
 
 
 def chain_matrices(parents: Sequence[int], local: Array, outer: Array) -> Array:

@@ -1,6 +1,6 @@
 """USD: characters of UsdSkel in, and motions out, on the character that they are of or on a mannequin.
 
-Needs the package usd-core. `read_character`, `write_character` and all that they call run in `mapctl.formats.sandbox`,
+Needs the package usd-core. `find_character`, `write_character` and all that they call run in `mapctl.formats.sandbox`,
 without torch.
 """
 
@@ -12,7 +12,6 @@ import os
 import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from fractions import Fraction
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,11 +27,14 @@ from mapctl.formats.parts import (
     MAX_JOINTS,
     FoundCharacter,
     MeshPart,
+    Poses,
     UnevenScaleError,
     chain_matrices,
+    check_poses,
     check_size,
     complete_bind_pose,
     decode_picture,
+    decode_srgb,
     encode_srgb,
     find_name,
     make_unique,
@@ -47,7 +49,7 @@ from mapctl.formats.sandbox import Refusal
 from mapctl.formats.text import MAX_FILE_BYTES, MAX_POSES
 
 if TYPE_CHECKING:  # the sandbox has no torch
-    from mapctl.formats.character import CharacterSource, SkinnedBody
+    from mapctl.formats.character import CharacterSource
     from mapctl.mesh.character_mesh import CharacterMesh
     from mapctl.motion import Motion
     from mapctl.skeleton import Skeleton
@@ -58,8 +60,6 @@ ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
 _ROOT = "/character"
 _WRITE_FAULT = re.compile(r"rror occurred writing file: (.+?)'")
 _REASON = re.compile(r"in file \S+ : '(.+?)'?\s*$", re.MULTILINE)
-_FASTEST_CODES = 240
-"""Time codes per second up to which each is a frame; more are parts of frames."""
 _MAX_LAYERS = 1000
 _MAX_PICTURE_BYTES = 2**28
 _TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -69,108 +69,12 @@ _MARGIN = 0.3
 """Metres around the joints within which the body is."""
 
 
-def load(path: str | PathLike[str]) -> "Motion":
-    """Read the animation of a skeleton from a .usd, .usda, .usdc or .usdz file; one frame of the rest pose where none
-    is bound to it.
-
-    `path` may end as `#SKELETON`, `#SKELETON/ANIMATION` or `#/ANIMATION`; a file of several skeletons is refused,
-    naming them. Joint frames are aligned with the world in the rest pose. FileFormatError names the fault of the
-    file.
-    """
-    from mapctl.formats import character
-
-    return character.load_motion(path, read_character, _place_poses)
+def read_character(path: Path, **choice: str | None) -> FoundCharacter:
+    """Read a character in a sandbox: see `find_character`."""
+    return sandbox.call(find_character, path, **choice)
 
 
-def load_rest(path: str | PathLike[str]) -> "Motion":
-    """Read one frame of the rest pose, as `load` reads an animation."""
-    from mapctl.formats import character
-
-    return character.load_rest(path, read_character)
-
-
-def load_mesh(path: str | PathLike[str]) -> "CharacterMesh":
-    """Read the meshes that are bound to a skeleton. `path` chooses as in `load`. FileFormatError where there is none,
-    or they are broken."""
-    from mapctl.formats import character
-
-    return character.load_mesh(path, read_character)
-
-
-@dataclass(frozen=True, eq=False)
-class Animation:
-    """Poses of a skeleton at the times at which any of its samples lies."""
-
-    per_second: float
-    """Time codes per second."""
-    seconds: Array
-    """(keys,) times of the samples, from time code 0 on."""
-    local: Array
-    """(keys, joints, 10) in the parents' frames: translation, rotation xyzw, scale."""
-    outer: Array
-    """(keys or 1, 4, 4) what takes the skeleton's space to the world."""
-
-
-def _place_poses(found: FoundCharacter) -> tuple[Fraction, Array]:
-    """Return frames per second and world matrices (frames, joints, 4, 4)."""
-    import torch
-
-    from mapctl import rotations
-    from mapctl.formats.character import compose_transforms
-
-    poses: Animation = found.poses
-    fps, times = _choose_times(poses, len(found.names))
-    outer = poses.outer
-    check_size(outer)
-    local = compose_transforms(interpolate(poses.seconds, poses.local, times))
-    if len(outer) > 1:
-        split = [split_scale(matrix) for matrix in outer]
-        turns = rotations.from_matrix(torch.from_numpy(np.array([turn for turn, _ in split]))).numpy()
-        scales = np.repeat([[scale] for _, scale in split], 3, axis=1)
-        moved = np.concatenate([outer[:, :3, 3], turns, scales], axis=1)[:, None]
-        outer = compose_transforms(interpolate(poses.seconds, moved, times))[:, 0]
-    return fps, chain_matrices(found.parents, local, outer)
-
-
-def _choose_times(poses: Animation, joints: int) -> tuple[Fraction, Array]:
-    """Return frames per second and the frames' times: the time codes, where all samples lie on them. Refusal where
-    there would be too many."""
-    from mapctl.formats.character import frame_rate_of, sample_times
-
-    seconds, per_second = poses.seconds, poses.per_second
-    _check_extent(int(min(seconds[-1] - seconds[0], 1e15)), joints)
-    codes = seconds * per_second
-    if per_second <= _FASTEST_CODES and np.abs(codes - np.rint(codes)).max() < 1e-4:
-        count = int(min(np.rint(codes[-1]) - np.rint(codes[0]) + 1, 1e15))
-        _check_extent(count, joints)
-        return frame_rate_of(per_second), (round(codes[0]) + np.arange(count)) / per_second
-    fps, times = sample_times(seconds)
-    _check_extent(len(times), joints)
-    return fps, times
-
-
-def interpolate(keys: Array, values: Array, times: Array) -> Array:
-    """Return transforms (times, joints, 10) of those at keys (keys, joints, 10): linear, rotations along their arcs."""
-    import torch
-
-    from mapctl import rotations
-
-    if len(keys) == len(times) and np.allclose(keys, times, atol=1e-9):
-        return values
-    after = np.searchsorted(keys, times, side="right").clip(1, len(keys) - 1) if len(keys) > 1 else np.zeros(1, int)
-    before = np.maximum(after - 1, 0)
-    gap = keys[after] - keys[before]
-    share = np.where(gap > 0, (times - keys[before]) / np.where(gap > 0, gap, 1.0), 0.0).clip(0.0, 1.0)
-    low, high = values[before], values[after]
-    done = low + (high - low) * share[:, None, None]
-    turns = [torch.from_numpy(np.ascontiguousarray(table[..., 3:7])).reshape(-1, 4) for table in (low, high)]
-    shares = torch.from_numpy(np.repeat(share, values.shape[1]))
-    units = [turn / turn.norm(dim=-1, keepdim=True).clamp_min(1e-12) for turn in turns]
-    done[..., 3:7] = rotations.slerp(units[0], units[1], shares).numpy().reshape(*low.shape[:2], 4)
-    return done
-
-
-def read_character(path: str, *, armature: str | None, animation: str | None, wanted: str) -> FoundCharacter:
+def find_character(path: str, *, armature: str | None, animation: str | None, wanted: str) -> FoundCharacter:
     """Read a skeleton, and `wanted` besides: `rest` nothing, `motion` its animation, `mesh` its triangles. Refusal
     names why not."""
     try:
@@ -450,7 +354,7 @@ def _attributes_of(prim: Usd.Prim) -> list[Usd.Attribute]:
     return [animation.GetTranslationsAttr(), animation.GetRotationsAttr(), animation.GetScalesAttr()]
 
 
-def _sample(stage: Usd.Stage, skeleton: SkeletonPrim, prim: Usd.Prim, name: str) -> Animation:
+def _sample(stage: Usd.Stage, skeleton: SkeletonPrim, prim: Usd.Prim, name: str) -> Poses:
     animation, attributes, what = UsdSkel.Animation(prim), _attributes_of(prim), f"animation {name!r}"
     codes = {code for attribute in attributes for code in attribute.GetTimeSamples()}
     placed = animated_placement(skeleton.prim)
@@ -460,15 +364,15 @@ def _sample(stage: Usd.Stage, skeleton: SkeletonPrim, prim: Usd.Prim, name: str)
     codes |= set(placed)
     if codes and not np.isfinite(sum(codes)):
         raise Refusal(f"{what} has times that are not finite")
-    _check_extent(len(codes), len(skeleton.joints))
+    check_poses(len(codes), len(skeleton.joints))
     if placed:
         span = range(int(np.ceil(min(codes))), int(min(np.floor(max(codes)), min(codes) + MAX_POSES)) + 1)
-        _check_extent(len(span), len(skeleton.joints))
+        check_poses(len(span), len(skeleton.joints))
         codes |= {float(code) for code in span}
     times = np.array(sorted(codes) or [0.0])
     local = _sample_joints(skeleton, animation, attributes, times, what)
     outer = [world_of(skeleton.prim, Usd.TimeCode(time)) for time in (times.tolist() if placed else times[:1].tolist())]
-    return Animation(per_second, times / per_second, local, np.array(outer))
+    return Poses(per_second, times / per_second, local, np.array(outer))
 
 
 def _sample_joints(
@@ -691,11 +595,6 @@ def _read_carriers(query: UsdSkel.SkinningQuery, count: int, what: str) -> tuple
 def _read_array(attribute: Usd.Attribute, width: int, dtype: type) -> Array:
     value = read_value(attribute)
     return np.array([] if value is None else value, dtype).reshape(-1, width)
-
-
-def _check_extent(frames: int, joints: int) -> None:
-    if frames * joints > MAX_POSES:
-        raise Refusal(f"{frames} frames of {joints} joints, allowed are {MAX_POSES} in all")
 
 
 def save(motion: "Motion", path: str | PathLike[str]) -> None:
@@ -944,7 +843,7 @@ def _build_stage(motion: "Motion") -> Usd.Stage:
     stage.SetEndTimeCode(motion.num_frames - 1)
     top = UsdSkel.Root.Define(stage, _ROOT)
     stage.SetDefaultPrim(top.GetPrim())
-    body = build_skinned_body(motion)
+    name, body = build_skinned_body(motion)
 
     skeleton = UsdSkel.Skeleton.Define(stage, f"{_ROOT}/skeleton")
     skeleton.CreateJointsAttr(joints)
@@ -971,7 +870,7 @@ def _build_stage(motion: "Motion") -> Usd.Stage:
     _write_samples(animation.CreateRotationsAttr(), Vt.QuatfArray, turns, codes)
     UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
 
-    UsdSkel.BindingAPI.Apply(_define_mesh(stage, body)).CreateSkeletonRel().SetTargets([skeleton.GetPath()])
+    UsdSkel.BindingAPI.Apply(_define_mesh(stage, name, body)).CreateSkeletonRel().SetTargets([skeleton.GetPath()])
     reach = motion.joint_positions().numpy().reshape(-1, 3)  # viewers frame the character by the extent
     corners = reach.min(0) - _MARGIN, reach.max(0) + _MARGIN
     top.CreateExtentAttr([Gf.Vec3f(*corner.tolist()) for corner in corners])
@@ -990,8 +889,8 @@ def joint_paths(skeleton: "Skeleton") -> list[str]:
     return found
 
 
-def _define_mesh(stage: Usd.Stage, body: "SkinnedBody") -> Usd.Prim:
-    mesh = UsdGeom.Mesh.Define(stage, f"{_ROOT}/{body.name}")
+def _define_mesh(stage: Usd.Stage, name: str, body: "CharacterMesh") -> Usd.Prim:
+    mesh = UsdGeom.Mesh.Define(stage, f"{_ROOT}/{name}")
     mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(body.vertices.astype(np.float32)))
     mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(body.faces), 3, np.int32)))
     mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(body.faces.reshape(-1).astype(np.int32)))
@@ -1000,7 +899,7 @@ def _define_mesh(stage: Usd.Stage, body: "SkinnedBody") -> Usd.Prim:
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     mesh.CreateExtentAttr([Gf.Vec3f(*corner.tolist()) for corner in (body.vertices.min(0), body.vertices.max(0))])
     colour = mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
-    colour.Set(Vt.Vec3fArray.FromNumpy(body.linear_rgb.astype(np.float32)))
+    colour.Set(Vt.Vec3fArray.FromNumpy(decode_srgb(body.rgba[:, :3]).astype(np.float32)))
     binding, width = UsdSkel.BindingAPI.Apply(mesh.GetPrim()), body.joints.shape[1]
     joints, weights = body.joints.reshape(-1).astype(np.int32), body.weights.reshape(-1).astype(np.float32)
     binding.CreateJointIndicesPrimvar(False, width).Set(Vt.IntArray.FromNumpy(joints))

@@ -305,43 +305,39 @@ Body = Mannequin | SkinnedBody
 """Body drawn for an actor."""
 
 
-@dataclass(frozen=True, eq=False)
-class Skin:
-    """Triangles in the frames of the joints that carry them."""
-
-    vertices: Array
-    """(n, 3) metres, each in its joint's frame."""
-    normals: Array
-    """(n, 3) unit, likewise."""
-    faces: Array
-    """(m, 3) vertex indices, counter-clockwise seen from outside; all three of one joint."""
-    rgb: Array
-    """(n, 3) sRGB, 0 to 1."""
-    joint: Array
-    """(n,) index of the joint."""
-
-
-def build_skin(motion: Motion, colour: str = "slate") -> Skin:
-    """Build the body of a motion; its frames show when feet are flat, so it should hold more than one step.
+def build_skin(motion: Motion, colour: str = "slate") -> CharacterMesh:
+    """Build the body of a motion in its skeleton's rest pose, with the root at the origin; its frames show when feet
+    are flat, so it should hold more than one step. Each triangle is carried by one joint.
 
     `colour` is the torso's: a name of `colours.ACTORS` or `#rrggbb`; RequestError otherwise.
     """
     body = Mannequin(motion, colours.rgb(colour))
-    boxes, joint_of_box = body.boxes(0), body.joints()
-    surfaces = [box.surface() for box in boxes]
-    counts = [len(surface.vertices) // len(box.centre) for surface, box in zip(surfaces, boxes, strict=True)]
-    joint = np.concatenate([np.repeat(joints, many) for joints, many in zip(joint_of_box, counts, strict=True)])
+    surfaces = [box.surface() for box in body.boxes(0)]
+    joint = np.concatenate(
+        [np.repeat(own, len(s.vertices) // len(own)) for own, s in zip(body.joints(), surfaces, strict=True)]
+    )
     whole = body.surface(0)
-    turn = body.anatomy.rotations[0, joint]
-    position = body.anatomy.points.world[0, joint]
     assert whole.normals is not None, "boxes are lit"
-    return Skin(
-        vertices=np.einsum("nji,nj->ni", turn, whole.vertices - position),
+    turn = body.anatomy.rotations[0, joint]
+    rest = place_at_rest(motion.skeleton)
+    local = np.einsum("nji,nj->ni", turn, whole.vertices - body.anatomy.points.world[0, joint])
+    return CharacterMesh(
+        vertices=local + rest[joint],
         normals=np.einsum("nji,nj->ni", turn, whole.normals),
         faces=whole.faces,
-        rgb=whole.rgba[:, :3],
-        joint=joint,
+        rgba=whole.rgba,
+        joints=joint[:, None],
+        weights=np.ones((len(joint), 1)),
+        rest=rest,
     )
+
+
+def place_at_rest(skeleton: Skeleton) -> Array:
+    """Return the joints (joints, 3) in the rest pose, metres, with the root at the origin."""
+    rest = np.zeros((skeleton.num_joints, 3))
+    for joint, parent in enumerate(skeleton.parents[1:], start=1):
+        rest[joint] = skeleton.offsets[joint].numpy() + rest[parent]
+    return rest
 
 
 def at_rest(skeleton: Skeleton = CANONICAL) -> Motion:

@@ -48,13 +48,16 @@ class MannequinBody:
             paths.append(f"{paths[parent] if parent >= 0 else name}/{skeleton.names[joint]}")
             offset = skeleton.offsets[joint].numpy()
             self._joints.append(scene.add_frame(paths[joint], show_axes=False, position=offset))
-            faces = body.faces[body.joint[body.faces[:, 0]] == joint]
+            faces = body.faces[body.joints[body.faces[:, 0], 0] == joint]
             if len(faces):
                 used, packed = np.unique(faces, return_inverse=True)
                 mesh = trimesh.Trimesh(
-                    body.vertices[used], packed.reshape(-1, 3), vertex_normals=body.normals[used], process=False
+                    body.vertices[used] - body.rest[joint],
+                    packed.reshape(-1, 3),
+                    vertex_normals=body.normals[used],
+                    process=False,
                 )
-                mesh.visual = ColorVisuals(mesh, vertex_colors=(255 * body.rgb[used]).round().astype(np.uint8))
+                mesh.visual = ColorVisuals(mesh, vertex_colors=(255 * body.rgba[used, :3]).round().astype(np.uint8))
                 scene.add_mesh_trimesh(f"{paths[joint]}/skin", mesh)
 
     def prepare(self, motion: Motion) -> list[Pose]:

@@ -17,7 +17,6 @@ import mapctl
 from mapctl import formats, rotations
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.formats import bvh
-from mapctl.formats import bvh as text
 from mapctl.formats.units import UNITS, frame_rate, guess_unit
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL
@@ -83,7 +82,7 @@ def world(tree, values):
 
 def agrees(path, positions, turns, scale):
     """Within 0.01 mm and 0.001 degree, as files of 6 decimals allow."""
-    motion = bvh.load(path)
+    motion = formats.load(path)
     found = rotations.to_matrix(motion.joint_rotations()).numpy()
     angle = np.degrees(2 * np.arcsin(np.linalg.norm(found - turns, axis=(-1, -2)) / np.sqrt(8)))
     assert np.abs(motion.joint_positions().numpy() - positions * scale).max() < 1e-5
@@ -134,7 +133,7 @@ def test_any_layout_is_read_as_defined_and_written_back_as_it_came(tmp_path_fact
     first, second, third = (folder / f"{name}.bvh" for name in ("first", "second", "third"))
     first.write_text(bvh.compose(tree, "0.0333333", values, decimals=6))
     positions, turns = world(tree, values)
-    motion = agrees(first, positions, turns, bvh.load(first).source.metres_per_unit)
+    motion = agrees(first, positions, turns, formats.load(first).source.metres_per_unit)
     motion.save(second)
     again = agrees(second, positions, turns, motion.source.metres_per_unit)
     assert again.source.hierarchy.channels == tree.channels
@@ -142,7 +141,7 @@ def test_any_layout_is_read_as_defined_and_written_back_as_it_came(tmp_path_fact
     again.save(third)
     motion.save(first)
     assert first.read_bytes() == second.read_bytes()
-    assert np.abs(bvh.read(third).values - bvh.read(second).values).max() < 1e-4
+    assert np.abs(bvh.read_text(third).values - bvh.read_text(second).values).max() < 1e-4
 
 
 QUIRKS = {
@@ -165,7 +164,7 @@ def test_quirk_reads_as_the_plain_file(quirk, tmp_path):
     (tmp_path / "plain.bvh").write_text(PLAIN)
     (tmp_path / "quirk.bvh").write_bytes(QUIRKS[quirk](PLAIN).encode())
     assert QUIRKS[quirk](PLAIN) != PLAIN
-    plain, odd = bvh.load(tmp_path / "plain.bvh"), bvh.load(tmp_path / "quirk.bvh")
+    plain, odd = formats.load(tmp_path / "plain.bvh"), formats.load(tmp_path / "quirk.bvh")
     assert odd.skeleton.names == plain.skeleton.names == ("hips", "leftUpperLeg", "leftFoot")
     assert torch.equal(odd.joint_positions(), plain.joint_positions())
     assert torch.equal(odd.local_quat_xyzw, plain.local_quat_xyzw)
@@ -175,7 +174,7 @@ def test_quirk_reads_as_the_plain_file(quirk, tmp_path):
 def test_a_name_in_an_old_encoding_goes_back_as_the_same_bytes(tmp_path):
     raw = PLAIN.replace("leftFoot", "Fuß").encode("latin-1")
     (tmp_path / "in.bvh").write_bytes(raw)
-    bvh.load(tmp_path / "in.bvh").save(tmp_path / "out.bvh")
+    formats.load(tmp_path / "in.bvh").save(tmp_path / "out.bvh")
     assert "Fuß".encode("latin-1") in (tmp_path / "out.bvh").read_bytes()
 
 
@@ -186,17 +185,17 @@ def test_unit_is_found_by_the_size_of_the_body_and_undone(unit, named, tmp_path)
     names = tuple(motion.skeleton.names if named else (f"bone{j}" for j in range(motion.num_joints)))
     motion = replace(motion, skeleton=replace(motion.skeleton, names=names, end_offsets={}))
     motion.save(tmp_path / "cm.bvh")
-    text = bvh.read(tmp_path / "cm.bvh")
+    text = bvh.read_text(tmp_path / "cm.bvh")
     offsets = tuple(tuple(float(x) * 0.01 / unit for x in offset) for offset in text.hierarchy.offsets)
     tree = replace(text.hierarchy, offsets=offsets)
     values = text.values.copy()
     values[:, :3] *= 0.01 / unit
     (tmp_path / "unit.bvh").write_text(bvh.compose(tree, "0.0333333", values, decimals=8))
-    read = bvh.load(tmp_path / "unit.bvh")
+    read = formats.load(tmp_path / "unit.bvh")
     assert read.source.metres_per_unit == unit
     torch.testing.assert_close(read.root_position, motion.root_position, atol=1e-6, rtol=0)
     read.save(tmp_path / "back.bvh")
-    back = np.array(bvh.read(tmp_path / "back.bvh").hierarchy.offsets)
+    back = np.array(bvh.read_text(tmp_path / "back.bvh").hierarchy.offsets)
     order = [names.index(name) for name in tree.names]
     assert np.abs(back[1:] - bones[order][1:]).max() < 1e-5 / unit
 
@@ -207,7 +206,7 @@ def test_a_body_of_any_size_is_read_back_at_its_size(size, tmp_path):
     bones, root = motion.skeleton.offsets * size, motion.root_position * size
     motion = replace(motion, skeleton=replace(motion.skeleton, offsets=bones, end_offsets={}), root_position=root)
     motion.save(tmp_path / "own.bvh")
-    read = bvh.load(tmp_path / "own.bvh")
+    read = formats.load(tmp_path / "own.bvh")
     order = [motion.skeleton.index(name) for name in read.skeleton.names]
     torch.testing.assert_close(read.skeleton.offsets[1:], bones[order][1:], rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(read.root_position, root, rtol=1e-5, atol=1e-6)
@@ -232,12 +231,12 @@ def standing(frames=20, seed=0) -> Motion:
 def test_a_motion_without_source_is_written_in_the_plain_layout(tmp_path):
     motion = standing()
     motion.save(tmp_path / "out.bvh")
-    tree = bvh.read(tmp_path / "out.bvh").hierarchy
+    tree = bvh.read_text(tmp_path / "out.bvh").hierarchy
     assert tree.offsets[0] == (0, 0, 0)
     assert tree.channels[0] == ("Xposition", "Yposition", "Zposition", "Zrotation", "Xrotation", "Yrotation")
     assert set(tree.channels[1:]) == {("Zrotation", "Xrotation", "Yrotation")}
     assert "Frame Time: 0.033333333\n" in (tmp_path / "out.bvh").read_text()
-    read = bvh.load(tmp_path / "out.bvh")
+    read = formats.load(tmp_path / "out.bvh")
     order = [read.skeleton.index(name) for name in CANONICAL.names]
     assert set(read.skeleton.names) == set(CANONICAL.names)
     assert read.skeleton.names[4:7] == ("head", "leftShoulder", "leftUpperArm")
@@ -251,13 +250,13 @@ def test_still_six_channel_joints_are_bones_and_travelling_ones_are_not(tmp_path
     head = text.split("Frames:")[0]
     rows = "5 0 0 0 0 0 10 90 0 1 2 3 0 -79 1 4 5 6\n5 0 0 0 0 0 11 90 0 1 2 3 0 -79 1 4 5 6\n"
     (tmp_path / "in.bvh").write_text(f"{head}Frames: 2\nFrame Time: 0.01\n{rows}")
-    motion = bvh.load(tmp_path / "in.bvh")
+    motion = formats.load(tmp_path / "in.bvh")
     assert list(motion.moving_offsets) == [1]
     assert motion.moving_offsets[1].tolist() == [[0.10, 0.9, 0], [0.11, 0.9, 0]]
     assert motion.skeleton.offsets[2].tolist() == [0, -0.79, 0.01]
     assert motion.root_position.tolist() == [[0.05, 0, 0], [0.05, 0, 0]]
     motion.save(tmp_path / "out.bvh")
-    before, after = (bvh.read(tmp_path / f"{name}.bvh") for name in ("in", "out"))
+    before, after = (bvh.read_text(tmp_path / f"{name}.bvh") for name in ("in", "out"))
     assert np.abs(before.values - after.values).max() < 1e-5
     assert before.hierarchy == after.hierarchy
 
@@ -269,11 +268,11 @@ def test_channels_are_added_where_the_source_cannot_hold_the_motion(tmp_path):
     head = text.split("Frames:")[0]
     rows = "10 20 30 1 2 3 7\n" * 20
     (tmp_path / "in.bvh").write_text(f"{head}Frames: 20\nFrame Time: 0.0333333\n{rows}")
-    source = bvh.load(tmp_path / "in.bvh")
+    source = formats.load(tmp_path / "in.bvh")
     moved = standing()
     wanted = replace(source, root_position=moved.root_position, local_quat_xyzw=moved.local_quat_xyzw[:, :3])
     wanted.save(tmp_path / "out.bvh")
-    read = bvh.load(tmp_path / "out.bvh")
+    read = formats.load(tmp_path / "out.bvh")
     assert [len(channels) for channels in read.source.hierarchy.channels] == [6, 3, 3]
     torch.testing.assert_close(read.joint_positions(), wanted.joint_positions(), atol=1e-7, rtol=0)
 
@@ -314,12 +313,12 @@ def test_two_joints_of_one_name_are_read_the_second_by_a_name_of_its_own(tmp_pat
 
 def written_angles(quat, order, tmp_path):
     """Angles written in the three channels of a single joint, degrees."""
-    tree = text.Hierarchy(("only",), (-1,), ((0.0,) * 3,), (tuple(AXES[a] + "rotation" for a in order),), {})
-    (tmp_path / "in.bvh").write_text(text.compose(tree, "0.01", np.zeros((1, 3)), decimals=6))
-    source = bvh.load(tmp_path / "in.bvh")
+    tree = bvh.Hierarchy(("only",), (-1,), ((0.0,) * 3,), (tuple(AXES[a] + "rotation" for a in order),), {})
+    (tmp_path / "in.bvh").write_text(bvh.compose(tree, "0.01", np.zeros((1, 3)), decimals=6))
+    source = formats.load(tmp_path / "in.bvh")
     root = torch.zeros(len(quat), 3, dtype=torch.float64)
     replace(source, root_position=root, local_quat_xyzw=quat[:, None]).save(tmp_path / "out.bvh")
-    return text.read(tmp_path / "out.bvh").values
+    return bvh.read_text(tmp_path / "out.bvh").values
 
 
 def euler_quat(degrees, order):
@@ -352,7 +351,7 @@ FRAMES = 40
 
 def restless(file, seed):
     """The file's angles as equal ones: now and then the other Euler solution, or by whole turns, joint by joint."""
-    read, draw = text.read(file), np.random.default_rng(seed)
+    read, draw = bvh.read_text(file), np.random.default_rng(seed)
     values = read.values.copy()
     for _, _, columns in read.hierarchy.rotation_groups():
         for joint in columns:
@@ -363,7 +362,7 @@ def restless(file, seed):
             other = (frame >= from_frame[0]) & (frame < from_frame[1])
             turns = 360 * draw.integers(-2, 3, (4, 3))[np.sort(draw.integers(0, 4, FRAMES))]
             values[:, joint] = np.where(other[:, None], twin, values[:, joint]) + turns
-    file.write_text(text.compose(read.hierarchy, read.frame_time, values, decimals=6))
+    file.write_text(bvh.compose(read.hierarchy, read.frame_time, values, decimals=6))
     return file
 
 
@@ -394,7 +393,7 @@ def test_frames_that_are_not_changed_have_the_numbers_of_the_file(source, tmp_pa
     start, stop = gap
     motion = turned(mapctl.load(source), start, stop)
     motion.save(tmp_path / "out.bvh")
-    before, after = (text.read(path).values for path in (source, tmp_path / "out.bvh"))
+    before, after = (bvh.read_text(path).values for path in (source, tmp_path / "out.bvh"))
     known = [frame for frame in range(FRAMES) if not start <= frame < stop]
     assert np.array_equal(before[known], after[known])
     again = mapctl.load(tmp_path / "out.bvh")
@@ -406,7 +405,7 @@ def test_angles_in_changed_frames_go_on_from_those_before_or_lead_to_those_after
     start, stop = gap
     motion = mapctl.load(source)
     turned(motion, start, stop, size=0.02).save(tmp_path / "out.bvh")
-    read = text.read(tmp_path / "out.bvh")
+    read = bvh.read_text(tmp_path / "out.bvh")
     edges = slice(max(0, start - 1), stop if start else stop + 1)
     for _, _, columns in read.hierarchy.rotation_groups():
         steps = np.abs(np.diff(read.values[edges][:, columns], axis=0))
