@@ -19,7 +19,7 @@ from mapctl.solver.budget import Budget, Meter
 from mapctl.solver.lbfgs import LbfgsSettings, differentiate, minimise
 from priors import checkpoints
 from priors.lstm_gmm.fast import FastRollout
-from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig, LstmState, Planting
+from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig, LstmState
 
 _OTHER_SIDE = {"left": "right", "right": "left"}
 
@@ -106,36 +106,8 @@ def read_pace_rates(holds: Mapping[str, Any]) -> dict[tuple[str, str], float]:
 
 
 _MIN_STD = 0.05  # least standard deviation of a unit of the memory: some hardly vary in the data
-
-
 _INFERRED_FRAMES = 10  # of a motion that has as many, which are to be likely after the state
 _SEARCH, _BUDGET = LbfgsSettings(max_iterations=30), Budget(evaluations=40)
-
-
-def infer_lstm_state(model: LstmGmm, known: LstmState, features: Float[Tensor, "frames size"]) -> LstmState:
-    """Find a state (batch of one) before `features` (physical units) that makes the first of them likely (Eq. 26).
-
-    `known` are states after motion of the data. The frame before the first is taken to equal the first. The result is
-    never less likely, a prior of the memory included, than the best of `known`; the same input gives the same state.
-    """
-    first, wanted = features[:1], features[None, :_INFERRED_FRAMES]
-    memory = torch.cat([known.hidden, known.cell], dim=-1)
-    centre, sigma = memory.mean(dim=1), memory.std(dim=1, correction=0).clamp_min(_MIN_STD)
-
-    def state_of(unknowns: Float[Tensor, "batch unknowns"]) -> LstmState:
-        memory = centre[:, None] + sigma[:, None] * unknowns.unflatten(-1, tuple(centre.shape)).transpose(0, 1)
-        hidden, cell = memory.chunk(2, dim=-1)
-        return LstmState(first.expand(len(unknowns), -1), hidden.contiguous(), cell.contiguous())
-
-    def energy(unknowns: Float[Tensor, "batch unknowns"]) -> Float[Tensor, " batch"]:
-        nats = model.log_prob(wanted.expand(len(unknowns), -1, -1), state_of(unknowns)).sum(-1)
-        return 0.5 * unknowns.square().sum(-1) - nats
-
-    with torch.no_grad():
-        starts = ((memory - centre[:, None]) / sigma[:, None]).transpose(0, 1).flatten(1)
-        start = starts[energy(starts).argmin()][None]
-    found = minimise(differentiate(energy), start, settings=_SEARCH, meter=Meter(_BUDGET))
-    return state_of(found.x)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -263,8 +235,29 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
         return self.reference.start_after(last_frame)
 
     def infer_state(self, features: Float[Tensor, "frames size"]) -> LstmState:
-        """Find the state before a motion that makes its first frames likely (Wang et al. 2019, Eq. 26)."""
-        return infer_lstm_state(self.reference, self.initial_states.state, features)
+        """Find a state (batch of one) before a motion that makes its first frames likely (Wang et al. 2019, Eq. 26).
+
+        The frame before the first is taken to equal the first. The result is never less likely, a prior of the memory
+        included, than the best of the initial states; the same input gives the same state.
+        """
+        known, first, wanted = self.initial_states.state, features[:1], features[None, :_INFERRED_FRAMES]
+        memory = torch.cat([known.hidden, known.cell], dim=-1)
+        centre, sigma = memory.mean(dim=1), memory.std(dim=1, correction=0).clamp_min(_MIN_STD)
+
+        def state_of(unknowns: Float[Tensor, "batch unknowns"]) -> LstmState:
+            memory = centre[:, None] + sigma[:, None] * unknowns.unflatten(-1, tuple(centre.shape)).transpose(0, 1)
+            hidden, cell = memory.chunk(2, dim=-1)
+            return LstmState(first.expand(len(unknowns), -1), hidden.contiguous(), cell.contiguous())
+
+        def energy(unknowns: Float[Tensor, "batch unknowns"]) -> Float[Tensor, " batch"]:
+            nats = self.log_prob(wanted.expand(len(unknowns), -1, -1), state_of(unknowns)).sum(-1)
+            return 0.5 * unknowns.square().sum(-1) - nats
+
+        with torch.no_grad():
+            starts = ((memory - centre[:, None]) / sigma[:, None]).transpose(0, 1).flatten(1)
+            start = starts[energy(starts).argmin()][None]
+        found = minimise(differentiate(energy), start, settings=_SEARCH, meter=Meter(_BUDGET))
+        return state_of(found.x)
 
     def log_prob(
         self,
@@ -289,10 +282,10 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
     def sample_planted(
         self, state: LstmState, frames: int, generator: torch.Generator, *, temperature: float = 1.0, sigma_speed: float
     ) -> tuple[Float[Tensor, "batch frames size"], LstmState]:
-        """Draw frames as `sample`, `temperature` a factor of the noise, given that planted toes stand (see `Planting`):
-        by the network, not the kernels. `sigma_speed` is the error of their speed in each coordinate, m/s."""
-        planting = Planting(sigma_speed)
-        return self.reference.sample(state, frames, generator, temperature=temperature, planting=planting)
+        """Draw frames as `sample`, `temperature` a factor of the noise, given that planted toes stand (see
+        `condition_on_standing`): by the network, not the kernels. `sigma_speed` is the error of their speed in each
+        coordinate, m/s."""
+        return self.reference.sample(state, frames, generator, temperature=temperature, sigma_speed=sigma_speed)
 
     def latents(
         self, features: Float[Tensor, "batch frames size"], state: LstmState

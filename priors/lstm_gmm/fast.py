@@ -15,7 +15,6 @@ kernels lie in one file because compiled code kept on disk goes stale by file.
 import math
 import platform
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -30,6 +29,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from mapctl.features import LAYOUT
 from mapctl.numerics.jit import make_jit_decorators
 from mapctl.protocols import DiscreteChoices, PreparedRollout
 from priors.lstm_gmm.network import LstmGmm, LstmState
@@ -162,40 +162,36 @@ def pad_batch_size(batch: int) -> int:
 
 def pack_constants(model: LstmGmm) -> MixtureConstants:
     """The mixture's numbers, and the rows of the head."""
-    config, size = model.config, model.layout.continuous
-    rows, features = round_up_to(size, ROW_STEP), round_up_to(model.layout.size, WIDTH_STEP)
-    mean, std = np.zeros(features, np.float32), np.ones(features, np.float32)
-    mean[: model.layout.size], std[: model.layout.size] = _to_numpy(model.mean), _to_numpy(model.std)
-    low, high = np.float32(config.min_log_sigma), np.float32(config.max_log_sigma)
+    config, size = model.config, LAYOUT.continuous
+    rows, features = round_up_to(size, ROW_STEP), round_up_to(LAYOUT.size, WIDTH_STEP)
+    std = np.ones(features, np.float32)
+    std[: LAYOUT.size] = _to_numpy(model.std)
     alone = torch.eye(size).repeat(config.components, 1, 1)
-    cholesky = np.ascontiguousarray(_to_numpy(alone if model.cholesky is None else model.cholesky))
     return MixtureConstants(
-        size,
-        rows,
-        2 * rows,
-        2 * rows + config.components,
-        np.float32(config.retain),
-        np.float32(config.clamp),
-        low,
-        high,
-        mean,
-        std,
-        cholesky,
+        continuous=size,
+        log_sigma=rows,
+        weight=2 * rows,
+        contact=2 * rows + config.components,
+        retain=np.float32(config.retain),
+        clamp=np.float32(config.clamp),
+        low=np.float32(config.min_log_sigma),
+        high=np.float32(config.max_log_sigma),
+        mean=_pad(_to_numpy(model.mean), features),
+        std=std,
+        cholesky=np.ascontiguousarray(_to_numpy(alone if model.cholesky is None else model.cholesky)),
     )
 
 
 def pack_weights(model: LstmGmm) -> Layers:
     """Padded copies of the weights: half precision where that holds them all and the processor converts it."""
-    width, features = _padded_sizes(model)
+    width, features = round_up_to(model.config.width, WIDTH_STEP), round_up_to(LAYOUT.size, WIDTH_STEP)
     gates = [[model.lstm.get_parameter(f"weight_{kind}_l{layer}") for kind in ("ih", "hh")] for layer in range(2)]
     weights = Layers(
-        fc1=_pad_matrix(_to_numpy(model.fc1.weight), width, features),
-        fc2=_pad_matrix(_to_numpy(model.fc2.weight), width, width),
-        lstm=np.stack(
-            [np.concatenate([_pack_gates(_to_numpy(m), width, width) for m in pair], axis=1) for pair in gates]
-        ),
-        fc3=_pad_matrix(_to_numpy(model.fc3.weight), width, width),
-        head=_pack_head(model, _to_numpy(model.out.weight), width),
+        fc1=_pad(_to_numpy(model.fc1.weight), width, features),
+        fc2=_pad(_to_numpy(model.fc2.weight), width, width),
+        lstm=np.stack([np.concatenate([_pack_gates(m, width, width) for m in pair], axis=1) for pair in gates]),
+        fc3=_pad(_to_numpy(model.fc3.weight), width, width),
+        head=_pack_head(model, model.out.weight, width),
     )
     with np.errstate(over="ignore"):
         halves: list[Any] = [weight.astype(np.float16) for weight in weights]
@@ -205,20 +201,15 @@ def pack_weights(model: LstmGmm) -> Layers:
 
 def pack_biases(model: LstmGmm) -> Layers:
     """Padded float32 copies of the biases."""
-    width, _ = _padded_sizes(model)
+    width = round_up_to(model.config.width, WIDTH_STEP)
     offsets = [model.lstm.get_parameter(f"bias_ih_l{k}") + model.lstm.get_parameter(f"bias_hh_l{k}") for k in range(2)]
     return Layers(
-        fc1=_pad_matrix(_to_column(model.fc1.bias), width, 1)[:, 0].copy(),
-        fc2=_pad_matrix(_to_column(model.fc2.bias), width, 1)[:, 0].copy(),
-        lstm=np.stack([_pack_gates(_to_column(offset), width, 1)[:, 0] for offset in offsets]),
-        fc3=_pad_matrix(_to_column(model.fc3.bias), width, 1)[:, 0].copy(),
-        head=_pack_head(model, _to_column(model.out.bias), 1)[..., 0].copy(),
+        fc1=_pad(_to_numpy(model.fc1.bias), width),
+        fc2=_pad(_to_numpy(model.fc2.bias), width),
+        lstm=np.stack([_pack_gates(offset, width) for offset in offsets]),
+        fc3=_pad(_to_numpy(model.fc3.bias), width),
+        head=_pack_head(model, model.out.bias),
     )
-
-
-def transpose_layers(weights: Layers) -> Layers:
-    """Copies with the last two axes exchanged, for pullbacks of several particles at once."""
-    return Layers(*(np.ascontiguousarray(weight.swapaxes(-1, -2)) for weight in weights))
 
 
 def allocate_tape(weights: Layers, *, slots: int, batch: int) -> Tape:
@@ -240,45 +231,30 @@ def allocate_tape(weights: Layers, *, slots: int, batch: int) -> Tape:
     )
 
 
-def _padded_sizes(model: LstmGmm) -> tuple[int, int]:
-    """Units of a layer and features of a frame."""
-    return round_up_to(model.config.width, WIDTH_STEP), round_up_to(model.layout.size, WIDTH_STEP)
-
-
 def _to_numpy(tensor: Tensor) -> Array:
     return tensor.detach().to("cpu", torch.float32).numpy()
 
 
-def _to_column(bias: Tensor) -> Array:
-    return _to_numpy(bias)[:, None]
+def _pad(array: Array, *shape: int) -> Array:
+    return np.pad(array, [(0, size - there) for size, there in zip(shape, array.shape, strict=True)])
 
 
-def _pad_matrix(matrix: Array, rows: int, columns: int) -> Array:
-    return np.pad(matrix, ((0, rows - matrix.shape[0]), (0, columns - matrix.shape[1])))
+def _pack_gates(values: Tensor, *shape: int) -> Array:
+    """Weights or biases of an LSTM layer, whose four gates are padded one by one."""
+    return np.concatenate([_pad(gate, *shape) for gate in np.split(_to_numpy(values), 4)])
 
 
-def _pack_gates(matrix: Array, width: int, columns: int) -> Array:
-    return np.concatenate([_pad_matrix(gate, width, columns) for gate in np.split(matrix, 4)])
-
-
-def _pack_head(model: LstmGmm, matrix: Array, columns: int) -> Array:
+def _pack_head(model: LstmGmm, values: Tensor, *columns: int) -> Array:
     """(components, H, columns) of the output layer's rows: weights, means, log sigmas, contacts."""
-    count, size = model.config.components, model.layout.continuous
-    weight, mean, log_sigma, contact = np.split(matrix, np.cumsum([count, count * size, count * size]))
+    count, size = model.config.components, LAYOUT.continuous
+    weight, mean, log_sigma, contact = np.split(_to_numpy(values), np.cumsum([count, count * size, count * size]))
     rows = round_up_to(size, ROW_STEP)
-    height = round_up_to(2 * rows + count + 2, WIDTH_STEP)
     heads = [
-        np.concatenate(
-            [
-                _pad_matrix(m, rows, columns),
-                _pad_matrix(s, rows, columns),
-                _pad_matrix(weight, count, columns),
-                _pad_matrix(contact, 2, columns),
-            ]
-        )
+        np.concatenate([_pad(m, rows, *m.shape[1:]), _pad(s, rows, *s.shape[1:]), weight, contact])
         for m, s in zip(np.split(mean, count), np.split(log_sigma, count), strict=True)
     ]
-    return np.stack([_pad_matrix(head, height, columns) for head in heads])
+    height = round_up_to(2 * rows + count + 2, WIDTH_STEP)
+    return np.stack([_pad(head, height, *columns) for head in heads])
 
 
 _ZERO, _HALF, _ONE, _TWO, _FOUR = (np.float32(value) for value in (0, 0.5, 1, 2, 4))
@@ -607,27 +583,15 @@ def compose_pullback(settings, tape, noise, component, t, d_feature, d_density, 
 
 
 @_entry
-def backward(
-    weights,
-    transposed,
-    nothing,
-    settings,
-    tape,
-    noise,
-    component,
-    d_feature,
-    d_density,
-    d_noise,
-    d_frame,
-    d_input,
-    d_cell,
-):
+def backward(weights, transposed, nothing, settings, tape, noise, component, d_feature, d_density, d_noise):
     """Pullback of `forward` by back-propagation through time: fills d_noise.
 
-    d_frame (batch, Z), d_input (2, batch, 2 W; the hidden state's half) and d_cell (2, batch, W) come in as zeros and
-    leave as gradients on the state. `transposed` is read for several particles only. `nothing` is a zero bias.
+    `transposed` is read for several particles only. `nothing` is a zero bias.
     """
     batch, width = len(noise), len(weights.fc2)
+    # On the state: of the next frame's input, of both layers' inputs and hidden states, and of their cells.
+    d_frame = np.zeros((batch, weights.fc1.shape[1]), np.float32)
+    d_input, d_cell = np.zeros((2, batch, 2 * width), np.float32), np.zeros((2, batch, width), np.float32)
     d_head = np.zeros((batch, weights.head.shape[1]), np.float32)
     d_third, d_above = np.zeros((batch, width), np.float32), np.zeros((batch, width), np.float32)
     d_gates, d_before = np.zeros((batch, 4 * width), np.float32), np.zeros_like(d_frame)
@@ -660,17 +624,6 @@ def backward(
                 d_frame[b, j] += d_before[b, j]
 
 
-@dataclass(frozen=True, eq=False)
-class _KernelPass:
-    """Activations that one forward pass keeps for the backward pass; rows beyond the batch are padding."""
-
-    tape: Tape
-    noise: Array
-    choices: ChoiceBuffers
-    features: Array
-    density: Array
-
-
 class FastRollout:
     """Rollouts of `model` with its weights as they are now, copied; later training does not reach them.
 
@@ -682,256 +635,166 @@ class FastRollout:
     def __init__(self, model: LstmGmm, *, relative: "FastRollout | None" = None):
         """Pack the weights; those of a `relative` are taken where its model has the same, as a conditioned copy has."""
         self._model = model
-        self._config, self._layout = model.config, model.layout
         shared = relative if relative is not None and model.shares_weights(relative._model) else None
-        self._weights = pack_weights(model) if shared is None else shared._weights
-        self._settings = pack_constants(model) if shared is None else shared._settings
-        self._biases = pack_biases(model)
-        self._zero_bias = np.zeros(2 * len(self._weights.fc2) + self._weights.fc1.shape[1], np.float32)
+        self.weights = pack_weights(model) if shared is None else shared.weights
+        self.settings = pack_constants(model) if shared is None else shared.settings
+        self.biases = pack_biases(model)
+        self.zero_bias = np.zeros(2 * len(self.weights.fc2) + self.weights.fc1.shape[1], np.float32)
 
     @cached_property
-    def _transposed(self) -> Layers:
+    def transposed(self) -> Layers:
         """Weights for the pullback of several particles; most searches have but one."""
-        return transpose_layers(self._weights)
+        return Layers(*(np.ascontiguousarray(weight.swapaxes(-1, -2)) for weight in self.weights))
 
     def plan(self, state: LstmState, noise: Float[Tensor, "batch frames continuous"]) -> DiscreteChoices:
         """The likeliest component and contact bits of each frame along the rollout that the noise gives."""
         batch, frames, _ = noise.shape
-        run = self._run(state, noise, _allocate_choices(batch, frames), LIKELIEST, slots=2)
-        return DiscreteChoices(_to_tensor(run.choices.component, batch), _to_tensor(run.choices.contacts, batch))
+        return FastWindow(self, state, _allocate_choices(batch, frames), batch, keeps=False).plan(noise)
 
     def rollout(
         self, state: LstmState, noise: Float[Tensor, "batch frames continuous"], plan: DiscreteChoices
     ) -> tuple[Float[Tensor, "batch frames size"], Float[Tensor, "batch frames"]]:
         """Features x = mu_k + sigma_k noise under the plan, and each frame's log density under component k.
 
-        Differentiable, once, with respect to the noise and to the state's previous frame, h and C.
-        ValueError if the plan does not fit noise and network (compiled code would read past its arrays).
+        Differentiable, once, with respect to the noise. ValueError if the plan does not fit noise and network
+        (compiled code would read past its arrays).
         """
-        if plan.component.shape != noise.shape[:2] or plan.contacts.shape != (*noise.shape[:2], 2):
-            raise ValueError(
-                f"the plan is for {tuple(plan.component.shape)} particles and frames, "
-                f"the noise for {tuple(noise.shape[:2])}"
-            )
-        self._check_components(plan)
-        batch = len(noise)
-        previous = state.last_frame.expand(batch, -1)
-        hidden, cell = state.hidden.expand(-1, batch, -1), state.cell.expand(-1, batch, -1)
-        return _Rollout.apply(noise, previous, hidden, cell, plan, self)
+        window = self.prepare(state, plan, keeps=noise.requires_grad)
+        return _Rollout.apply(noise, window)
 
     def sample(
         self, state: LstmState, frames: int, generator: torch.Generator, *, temperature: float = 1.0
     ) -> tuple[Float[Tensor, "batch frames size"], LstmState]:
         """Frames drawn one after the other (section 4.1.4): the model's in distribution, not in numbers."""
-        batch, size = len(state.last_frame), self._layout.continuous
-        noise = temperature * torch.randn(batch, frames, size, generator=generator)
+        batch = len(state.last_frame)
+        noise = temperature * torch.randn(batch, frames, LAYOUT.continuous, generator=generator)
         choices = _allocate_choices(batch, frames, torch.rand(batch, frames, 3, generator=generator))
-        run = self._run(state, noise, choices, SAMPLED, slots=2)
-        features = _to_tensor(run.features, batch).to(state.last_frame.dtype)
-        return features, self._state_after(run, features[:, -1])
+        return FastWindow(self, state, choices, batch, keeps=False).sample(noise)
 
-    def _check_components(self, plan: DiscreteChoices) -> None:
-        if plan.component.amin() < 0 or plan.component.amax() >= self._config.components:
-            raise ValueError(f"the plan names a component outside 0 to {self._config.components - 1}")
-
-    def prepare(self, state: LstmState, plan: DiscreteChoices) -> "FastWindow":
-        """Prepare rollouts of so many particles from one state under one plan, whose memory is used again and again.
-
-        ValueError if the plan names a component that there is not.
+    def prepare(self, state: LstmState, plan: DiscreteChoices, *, keeps: bool = True) -> "FastWindow":
+        """Prepare rollouts of so many particles from one state under one plan, whose memory is used again and again;
+        with a pullback if `keeps`. ValueError if the plan names a component that there is not.
         """
-        self._check_components(plan)
-        batch, frames = plan.component.shape
+        batch, count = len(plan.component), self._model.config.components
+        if plan.contacts.shape != (*plan.component.shape, 2):
+            raise ValueError(f"a plan has components {plan.component.shape}, but contacts {plan.contacts.shape}")
+        if plan.component.amin() < 0 or plan.component.amax() >= count:
+            raise ValueError(f"the plan names a component outside 0 to {count - 1}")
         rows = pad_batch_size(batch)
-        choices = ChoiceBuffers(*(_pad_rows(part, rows) for part in _plan_buffers(plan)))
-        return FastWindow(self, state, choices, (batch, frames))
+        choices = ChoiceBuffers(*(_pad_rows(each.numpy(), rows) for each in vars(plan).values()), _NO_UNIFORM)
+        return FastWindow(self, state, choices, batch, keeps=keeps)
 
     def plan_window(
         self, state: LstmState, noise: Float[Tensor, "batch frames continuous"]
     ) -> tuple[DiscreteChoices, "FastWindow"]:
         """`plan`, and rollouts prepared under it, of which that of this noise is done already."""
         batch, frames, _ = noise.shape
-        window = FastWindow(self, state, _allocate_choices(pad_batch_size(batch), frames), (batch, frames))
+        window = FastWindow(self, state, _allocate_choices(batch, frames), batch)
         return window.plan(noise), window
-
-    def _run(self, state: LstmState, noise: Tensor, choices: ChoiceBuffers, source: int, *, slots: int) -> _KernelPass:
-        batch, frames, continuous = noise.shape
-        if continuous != self._layout.continuous:
-            raise ValueError(f"noise has {continuous} values a frame, the network {self._layout.continuous}")
-        rows = pad_batch_size(batch)
-        run = _KernelPass(
-            self._begin_tape(state, slots=slots, batch=batch),
-            _pad_rows(_to_array(noise), rows),
-            ChoiceBuffers(*(_pad_rows(part, rows) for part in choices)),
-            np.empty((rows, frames, self._layout.size), np.float32),
-            np.empty((rows, frames), np.float32),
-        )
-        self._roll(run, source)
-        return run
-
-    def _begin_tape(self, state: LstmState, *, slots: int, batch: int) -> Tape:
-        """A tape that begins in a state."""
-        width, size, settings, lanes = self._config.width, self._layout.size, self._settings, len(self._weights.fc2)
-        tape = allocate_tape(self._weights, slots=slots, batch=pad_batch_size(batch))
-        tape.frame[0, :batch, :size] = (_to_array(state.last_frame) - settings.mean[:size]) / settings.std[:size]
-        tape.lstm_input[0, :, :, lanes:] = 0
-        tape.lstm_input[0, :, :batch, lanes : lanes + width] = _to_array(state.hidden)
-        tape.cell[0] = 0
-        tape.cell[0, :, :batch, :width] = _to_array(state.cell)
-        return tape
-
-    def _roll(self, run: _KernelPass, source: int) -> None:
-        forward(
-            self._weights,
-            self._biases,
-            self._settings,
-            run.tape,
-            run.noise,
-            run.choices,
-            source,
-            run.features,
-            run.density,
-        )
-
-    def _state_after(self, run: _KernelPass, previous: Float[Tensor, "batch size"]) -> LstmState:
-        slot, batch, width = run.noise.shape[1] % len(run.tape.frame), len(previous), self._config.width
-        lanes = len(self._weights.fc2)
-        hidden = run.tape.lstm_input[slot, :, :batch, lanes : lanes + width]
-        cell = run.tape.cell[slot, :, :batch, :width]
-        return LstmState(previous, *(torch.from_numpy(part.copy()).to(previous.dtype) for part in (hidden, cell)))
-
-    def _pull_back(self, run: _KernelPass, d_features: Tensor, d_density: Tensor) -> tuple[Array, Array, Array, Array]:
-        """Gradients on the noise, the previous frame (physical units), h and C."""
-        batch, rows, lanes = len(d_features), len(run.noise), len(self._weights.fc2)
-        width, size = self._config.width, self._layout.size
-        pulled = (_pad_rows(_to_array(d_features), rows), _pad_rows(_to_array(d_density), rows))
-        d_noise = np.empty_like(run.noise)
-        d_frame, d_input, d_cell = self._unroll(run, *pulled, d_noise)
-        d_previous = d_frame[:batch, :size] / self._settings.std[:size]
-        return (d_noise[:batch], d_previous, d_input[:, :batch, lanes : lanes + width], d_cell[:, :batch, :width])
-
-    def _unroll(
-        self, run: _KernelPass, d_features: Array, d_density: Array, d_noise: Array
-    ) -> tuple[Array, Array, Array]:
-        """Fill d_noise; return the gradients on the first slot of the tape."""
-        on_state = (run.tape.frame[0], run.tape.lstm_input[0], run.tape.cell[0])
-        d_frame, d_input, d_cell = (np.zeros_like(part) for part in on_state)
-        backward(
-            self._weights,
-            self._weights if len(run.noise) == 1 else self._transposed,
-            self._zero_bias,
-            self._settings,
-            run.tape,
-            run.noise,
-            run.choices.component,
-            d_features,
-            d_density,
-            d_noise,
-            d_frame,
-            d_input,
-            d_cell,
-        )
-        return d_frame, d_input, d_cell
 
 
 class FastWindow(PreparedRollout):
-    """Rollouts of a window under one plan, one after the other, in the same memory."""
+    """Rollouts of a window under one plan, one after the other, in the same memory; rows beyond the batch are
+    padding."""
 
-    def __init__(self, fast: FastRollout, state: LstmState, choices: ChoiceBuffers, shape: tuple[int, int]):
-        """Allocate for `shape`, particles and frames."""
-        self._fast, self._batch = fast, shape[0]
-        rows, frames, size = pad_batch_size(shape[0]), shape[1], fast._layout.size
-        self._run = _KernelPass(
-            fast._begin_tape(state, slots=frames + 1, batch=shape[0]),
-            np.zeros((rows, frames, fast._layout.continuous), np.float32),
-            choices,
-            np.empty((rows, frames, size), np.float32),
+    def __init__(self, fast: FastRollout, state: LstmState, choices: ChoiceBuffers, batch: int, *, keeps: bool = True):
+        """Allocate for a batch from a state. Only a pullback needs that the tape `keeps` every frame's activations;
+        else they would but push the weights out of cache."""
+        self._fast, self._choices, self._batch = fast, choices, batch
+        self._kind = state.last_frame.dtype
+        rows, frames = choices.component.shape
+        settings, self._width, lanes = fast.settings, state.hidden.shape[-1], len(fast.weights.fc2)
+        self._hidden = slice(lanes, lanes + self._width)  # columns of a layer's input
+        self._tape = tape = allocate_tape(fast.weights, slots=frames + 1 if keeps else 2, batch=rows)
+        normalised = (_to_numpy(state.last_frame) - settings.mean[: LAYOUT.size]) / settings.std[: LAYOUT.size]
+        tape.frame[0, :batch, : LAYOUT.size] = normalised
+        tape.lstm_input[0, :, :, lanes:] = 0
+        tape.lstm_input[0, :, :batch, self._hidden] = _to_numpy(state.hidden)
+        tape.cell[0] = 0
+        tape.cell[0, :, :batch, : self._width] = _to_numpy(state.cell)
+        self._noise = np.zeros((rows, frames, LAYOUT.continuous), np.float32)
+        self._features, self._density = (
+            np.empty((rows, frames, LAYOUT.size), np.float32),
             np.empty((rows, frames), np.float32),
         )
-        self._pulled = (np.zeros((rows, frames, size), np.float32), np.zeros((rows, frames), np.float32))
-        self._d_noise = np.empty_like(self._run.noise)
+        self._d_features, self._d_density = np.zeros_like(self._features), np.zeros_like(self._density)
+        self._d_noise = np.empty_like(self._noise)
         self._rolled = False
 
     def plan(self, noise: Float[Tensor, "batch frames continuous"]) -> DiscreteChoices:
         """Make the plan the likeliest along the rollout of this noise."""
         self._roll(noise, LIKELIEST)
-        parts = (self._run.choices.component, self._run.choices.contacts)
-        return DiscreteChoices(*(_to_tensor(part, self._batch).clone() for part in parts))
+        parts = (self._choices.component, self._choices.contacts)
+        return DiscreteChoices(*(torch.from_numpy(part[: self._batch].copy()) for part in parts))
+
+    def sample(
+        self, noise: Float[Tensor, "batch frames continuous"]
+    ) -> tuple[Float[Tensor, "batch frames size"], LstmState]:
+        """Roll out with components and bits by the choices' random numbers; also return the state after it."""
+        self._roll(noise, SAMPLED)
+        slot, batch = noise.shape[1] % len(self._tape.frame), self._batch
+        memory = (self._tape.lstm_input[slot, :, :batch, self._hidden], self._tape.cell[slot, :, :batch, : self._width])
+        features = torch.from_numpy(self._features[:batch]).to(self._kind)
+        return features, LstmState(features[:, -1], *(torch.from_numpy(part.copy()).to(self._kind) for part in memory))
 
     def roll_out(
         self, noise: Float[Tensor, "batch frames continuous"]
     ) -> tuple[Float[Tensor, "batch frames size"], Float[Tensor, "batch frames"]]:
         """See PreparedRollout."""
-        run, batch = self._run, self._batch
-        if not (self._rolled and np.array_equal(run.noise[:batch], noise.numpy())):
+        batch = self._batch
+        if not (self._rolled and np.array_equal(self._noise[:batch], noise.numpy())):
             self._roll(noise, GIVEN)
-        return _to_tensor(run.features, batch).to(noise.dtype, copy=True), _to_tensor(run.density, batch).to(
-            noise.dtype, copy=True
-        )
+        found = (torch.from_numpy(part[:batch]) for part in (self._features, self._density))
+        features, density = (part.to(noise.dtype, copy=True) for part in found)
+        return features, density
 
     def _roll(self, noise: Tensor, source: int) -> None:
-        self._run.noise[: self._batch] = _to_array(noise)
-        self._fast._roll(self._run, source)
+        wanted = self._noise[: self._batch]
+        if noise.shape != wanted.shape:
+            raise ValueError(f"noise of {tuple(noise.shape)} does not fit rollouts of {wanted.shape}")
+        wanted[:] = _to_numpy(noise)
+        fast, tape = self._fast, self._tape
+        forward(
+            *(fast.weights, fast.biases, fast.settings, tape, self._noise, self._choices, source),
+            *(self._features, self._density),
+        )
         self._rolled = True
 
     def pull_back(
         self, d_features: Float[Tensor, "batch frames size"], d_log_density: Float[Tensor, "batch frames"]
     ) -> Float[Tensor, "batch frames continuous"]:
         """See PreparedRollout."""
-        for pulled, given in zip(self._pulled, (d_features, d_log_density), strict=True):
-            pulled[: self._batch] = given.numpy()
-        self._fast._unroll(self._run, *self._pulled, self._d_noise)
-        return _to_tensor(self._d_noise, self._batch).to(d_features.dtype, copy=True)
+        fast, batch = self._fast, self._batch
+        self._d_features[:batch], self._d_density[:batch] = d_features.numpy(), d_log_density.numpy()
+        transposed = fast.weights if len(self._noise) == 1 else fast.transposed
+        backward(
+            *(fast.weights, transposed, fast.zero_bias, fast.settings, self._tape, self._noise),
+            *(self._choices.component, self._d_features, self._d_density, self._d_noise),
+        )
+        return torch.from_numpy(self._d_noise[:batch]).to(d_features.dtype, copy=True)
 
 
 class _Rollout(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any,
-        noise: Tensor,
-        previous: Tensor,
-        hidden: Tensor,
-        cell: Tensor,
-        plan: DiscreteChoices,
-        fast: FastRollout,
-    ):
-        batch, frames, _ = noise.shape
-        choices = _plan_buffers(plan)
-        # Only a pullback needs every frame's activations; else they would but push the weights out of cache.
-        slots = frames + 1 if any(ctx.needs_input_grad) else 2
-        run = fast._run(LstmState(previous, hidden, cell), noise, choices, GIVEN, slots=slots)
-        ctx.run, ctx.fast, ctx.types = run, fast, (noise.dtype, previous.dtype, hidden.dtype, cell.dtype)
-        return _to_tensor(run.features, batch).to(noise.dtype), _to_tensor(run.density, batch).to(noise.dtype)
+    def forward(ctx: Any, noise: Tensor, window: FastWindow):
+        ctx.window = window
+        return window.roll_out(noise.detach())
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *pulled: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
-        gradients = ctx.fast._pull_back(ctx.run, *pulled)
-        tensors = [torch.from_numpy(part).to(kind) for part, kind in zip(gradients, ctx.types, strict=True)]
-        return *tensors, None, None
+        return ctx.window.pull_back(*pulled), None
 
 
 _NO_UNIFORM = np.zeros((1, 1, 3), np.float32)
 
 
-def _plan_buffers(plan: DiscreteChoices) -> ChoiceBuffers:
-    return ChoiceBuffers(plan.component.numpy(), plan.contacts.numpy(), _NO_UNIFORM)
-
-
 def _allocate_choices(batch: int, frames: int, uniform: Tensor | None = None) -> ChoiceBuffers:
-    drawn = _NO_UNIFORM if uniform is None else uniform.numpy()
-    return ChoiceBuffers(np.zeros((batch, frames), np.int64), np.zeros((batch, frames, 2), np.bool_), drawn)
-
-
-def _to_array(tensor: Tensor) -> Array:
-    return np.ascontiguousarray(tensor.detach().to(torch.float32).numpy())
+    rows = pad_batch_size(batch)
+    drawn = _NO_UNIFORM if uniform is None else _pad_rows(uniform.numpy(), rows)
+    return ChoiceBuffers(np.zeros((rows, frames), np.int64), np.zeros((rows, frames, 2), np.bool_), drawn)
 
 
 def _pad_rows(array: np.ndarray, rows: int) -> np.ndarray:
     """Contiguous, with rows of zeros up to `rows`."""
-    if len(array) == rows:
-        return np.ascontiguousarray(array)
-    return np.concatenate([array, np.zeros((rows - len(array), *array.shape[1:]), array.dtype)])
-
-
-def _to_tensor(array: np.ndarray, batch: int) -> Tensor:
-    return torch.from_numpy(array[:batch])
+    return np.ascontiguousarray(np.concatenate([array, np.zeros((rows - len(array), *array.shape[1:]), array.dtype)]))

@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT, PRIOR_FPS, FeatureLayout
+from mapctl.features import LAYOUT, PRIOR_FPS
 from mapctl.kinematics.fast import place_joints
 from mapctl.protocols import DensityState, DiscreteChoices
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
@@ -41,50 +41,40 @@ _CHANGES = torch.zeros(1 + len(_MOVING), LAYOUT.size)
 _CHANGES[torch.arange(1, 1 + len(_MOVING)), _MOVING] = _CHANGE
 
 
-@dataclass(frozen=True)
-class Planting:
-    """How firmly toes stand that are planted in a frame and in the one before it."""
-
-    sigma_speed: float
-    """Standard deviation of each coordinate of a toe's speed, m/s."""
-
-    def condition(
-        self,
-        before: Float[Tensor, "batch size"],
-        sample: Float[Tensor, "batch size"],
-        mean: Float[Tensor, "batch continuous"],
-        factor: Float[Tensor, "batch continuous continuous"],
-        generator: torch.Generator,
-    ) -> Float[Tensor, "batch size"]:
-        """Turn a sample of Gaussians with a mean and a factor of the covariance (physical units) into one of them given
-        the steps of toes that are planted in it and in the frame `before`."""
-        planted = (LAYOUT.pick(before, "contacts") > 0.5) & (LAYOUT.pick(sample, "contacts") > 0.5)
-        sigma = self.sigma_speed / PRIOR_FPS
-        error = sigma * torch.randn(len(sample), 2, 3, generator=generator).to(sample)  # drawn whoever stands
-        if not bool(planted.any()):
-            return sample
-        size = LAYOUT.continuous
-        base = torch.cat([mean, sample[:, size:]], dim=-1)
-        still = torch.cat([torch.zeros_like(before[:, :3]), before[:, 3:]], dim=-1)  # where the frame comes from
-        positions = _place_toes(torch.cat([base[:, None] + _CHANGES.to(base), still[:, None]], dim=1))
-        positions, stood = positions[:, :-1], positions[:, -1]
-        given = planted[..., None].expand(-1, -1, 3).flatten(1)
-        jacobian = factor.new_zeros(len(sample), 6, size)
-        jacobian[..., _MOVING] = ((positions[:, 1:] - positions[:, :1]) / _CHANGE).transpose(1, 2)
-        jacobian = torch.where(given[..., None], jacobian, 0.0)
-        step = positions[:, 0] - stood + torch.einsum("bij,bj->bi", jacobian, sample[:, :size] - mean)
-        spread = jacobian @ factor  # of the steps, along the Gaussian's own axes
-        covariance = spread @ spread.mT + sigma**2 * torch.eye(6).to(spread)
-        miss = torch.where(given, error.flatten(1) - step, 0.0)
-        change = factor @ (spread.mT @ torch.linalg.solve(covariance, miss[..., None]))
-        return torch.cat([sample[:, :size] + change[..., 0], sample[:, size:]], dim=-1)
-
-
-def _place_toes(features: Float[Tensor, "batch variants size"]) -> Float[Tensor, "batch variants 6"]:
-    """Positions of both toes after one frame from the origin, metres."""
-    ground, heading = LAYOUT.pick(features, "root_displacement_heading"), LAYOUT.pick(features, "heading_change")
-    positions = place_joints(features, ground.contiguous(), heading[..., 0].contiguous(), CANONICAL)
-    return positions[:, :, list(TOE_JOINTS)].flatten(2)
+def condition_on_standing(
+    sigma_speed: float,
+    before: Float[Tensor, "batch size"],
+    sample: Float[Tensor, "batch size"],
+    mean: Float[Tensor, "batch continuous"],
+    factor: Float[Tensor, "batch continuous continuous"],
+    generator: torch.Generator,
+) -> Float[Tensor, "batch size"]:
+    """Turn a sample of Gaussians with a mean and a factor of the covariance (physical units) into one of them given
+    the steps of toes that are planted in it and in the frame `before`. `sigma_speed` is the standard deviation of each
+    coordinate of such a toe's speed, m/s."""
+    planted = (LAYOUT.pick(before, "contacts") > 0.5) & (LAYOUT.pick(sample, "contacts") > 0.5)
+    sigma = sigma_speed / PRIOR_FPS
+    error = sigma * torch.randn(len(sample), 2, 3, generator=generator).to(sample)  # drawn whoever stands
+    if not bool(planted.any()):
+        return sample
+    size = LAYOUT.continuous
+    base = torch.cat([mean, sample[:, size:]], dim=-1)
+    still = torch.cat([torch.zeros_like(before[:, :3]), before[:, 3:]], dim=-1)  # where the frame comes from
+    variants = torch.cat([base[:, None] + _CHANGES.to(base), still[:, None]], dim=1)
+    ground, heading = LAYOUT.pick(variants, "root_displacement_heading"), LAYOUT.pick(variants, "heading_change")
+    positions = place_joints(variants, ground.contiguous(), heading[..., 0].contiguous(), CANONICAL)
+    positions = positions[:, :, list(TOE_JOINTS)].flatten(2)
+    positions, stood = positions[:, :-1], positions[:, -1]
+    given = planted[..., None].expand(-1, -1, 3).flatten(1)
+    jacobian = factor.new_zeros(len(sample), 6, size)
+    jacobian[..., _MOVING] = ((positions[:, 1:] - positions[:, :1]) / _CHANGE).transpose(1, 2)
+    jacobian = torch.where(given[..., None], jacobian, 0.0)
+    step = positions[:, 0] - stood + torch.einsum("bij,bj->bi", jacobian, sample[:, :size] - mean)
+    spread = jacobian @ factor  # of the steps, along the Gaussian's own axes
+    covariance = spread @ spread.mT + sigma**2 * torch.eye(6).to(spread)
+    miss = torch.where(given, error.flatten(1) - step, 0.0)
+    change = factor @ (spread.mT @ torch.linalg.solve(covariance, miss[..., None]))
+    return torch.cat([sample[:, :size] + change[..., 0], sample[:, size:]], dim=-1)
 
 
 NOISE_UNIT = 0.1
@@ -180,26 +170,19 @@ class LstmGmm(nn.Module):
     std: Tensor
     blur: Tensor | None
 
-    def __init__(
-        self,
-        config: LstmGmmConfig,
-        *,
-        mean: Float[Tensor, " size"],
-        std: Float[Tensor, " size"],
-        layout: FeatureLayout = LAYOUT,
-    ):
+    def __init__(self, config: LstmGmmConfig, *, mean: Float[Tensor, " size"], std: Float[Tensor, " size"]):
         super().__init__()
-        self.config, self.layout = config, layout
+        self.config = config
         self.register_buffer("mean", mean.clone())
         self.register_buffer("std", std.clone())
         self.register_buffer("blur", None)
-        width, outputs = config.width, config.components * (1 + 2 * layout.continuous) + 2
-        self.fc1, self.fc2 = nn.Linear(layout.size, width), nn.Linear(width, width)
+        width, outputs = config.width, config.components * (1 + 2 * LAYOUT.continuous) + 2
+        self.fc1, self.fc2 = nn.Linear(LAYOUT.size, width), nn.Linear(width, width)
         self.lstm = nn.LSTM(width, width, num_layers=2, batch_first=True)
         self.fc3, self.out = nn.Linear(width, width), nn.Linear(width, outputs)
         conditions = int(config.knows_noise) + len(config.labels)
         self.condition = nn.Linear(conditions, width, bias=False) if conditions else None
-        square = (config.components, layout.continuous, layout.continuous)
+        square = (config.components, LAYOUT.continuous, LAYOUT.continuous)
         self.correlation = nn.Parameter(torch.zeros(square)) if config.correlated else None
 
     @property
@@ -207,14 +190,14 @@ class LstmGmm(nn.Module):
         """Unit lower triangular factor of each component: it takes the values' correlation away."""
         if self.correlation is None:
             return None
-        return torch.tril(self.correlation, -1) + torch.eye(self.layout.continuous).to(self.correlation)
+        return torch.tril(self.correlation, -1) + torch.eye(LAYOUT.continuous).to(self.correlation)
 
     @property
     def cholesky(self) -> Float[Tensor, "components continuous continuous"] | None:
         """Inverse of `inverse_cholesky`: it makes independent values correlated."""
         if (inverse_cholesky := self.inverse_cholesky) is None:
             return None
-        unit = torch.eye(self.layout.continuous).to(inverse_cholesky).expand_as(inverse_cholesky)
+        unit = torch.eye(LAYOUT.continuous).to(inverse_cholesky).expand_as(inverse_cholesky)
         return torch.linalg.solve_triangular(inverse_cholesky, unit, upper=False, unitriangular=True)
 
     def conditioned_on(self, labels: Iterable[str]) -> "LstmGmm":
@@ -252,7 +235,7 @@ class LstmGmm(nn.Module):
         A sharp density hardly grades motions that are off by more than it allows. What the errors add to the correlated
         values is taken to be independent as well, so that the result is still a density.
         """
-        model, size = self._copy_with_same_weights(), self.layout.continuous
+        model, size = self._copy_with_same_weights(), LAYOUT.continuous
         variance = (sigma.to(self.std) / self.std[:size]).square().expand(self.config.components, size)
         if (inverse_cholesky := self.inverse_cholesky) is not None:
             variance = torch.einsum("kij,kj->ki", inverse_cholesky.detach().square(), variance)
@@ -288,7 +271,7 @@ class LstmGmm(nn.Module):
         return self._mixture(self.out(torch.relu(self.fc3(x))).to(inputs.dtype), inputs), memory
 
     def _mixture(self, output: Tensor, inputs: Tensor) -> Mixture:
-        config, size = self.config, self.layout.continuous
+        config, size = self.config, LAYOUT.continuous
         count = config.components
         weight, mean, log_sigma, contact = output.split([count, count * size, count * size, 2], dim=-1)
         mean, log_sigma = mean.unflatten(-1, (count, size)), log_sigma.unflatten(-1, (count, size))
@@ -309,9 +292,7 @@ class LstmGmm(nn.Module):
 
         `inputs` are the frames as the network takes them in, where they differ: the noisy inputs of Eq. 15.
         """
-        given = features if inputs is None else inputs
-        before = torch.cat([state.last_frame.unsqueeze(1), given[:, :-1]], dim=1)
-        mixture, _ = self(self.normalise(before), (state.hidden, state.cell))
+        mixture, _ = self._predict(state, features if inputs is None else inputs)
         return mixture.log_prob(self._target(features), self.inverse_cholesky, self.blur)
 
     def advance(
@@ -322,10 +303,8 @@ class LstmGmm(nn.Module):
         condition: Float[Tensor, "batch conditions"] | None = None,
     ) -> LstmState:
         """Return the state after the committed frames, without gradient; `condition` is as in `forward`."""
-        before = torch.cat([state.last_frame.unsqueeze(1), committed[:, :-1]], dim=1)
         with torch.no_grad():
-            _, (hidden, cell) = self(self.normalise(before), (state.hidden, state.cell), condition=condition)
-        return LstmState(committed[:, -1], hidden, cell)
+            return LstmState(committed[:, -1], *self._predict(state, committed, condition)[1])
 
     def sample(
         self,
@@ -334,27 +313,27 @@ class LstmGmm(nn.Module):
         generator: torch.Generator,
         *,
         temperature: float = 1.0,
-        planting: Planting | None = None,
+        sigma_speed: float | None = None,
         condition: Float[Tensor, "batch conditions"] | None = None,
+        differentiable: bool = False,
     ) -> tuple[Float[Tensor, "batch frames size"], LstmState]:
-        """Draw frames one after the other (section 4.1.4); temperature scales the Gaussians' sigmas, with `planting`
-        each frame is drawn given that toes stand where its bits are 1, and `condition` is as in `forward`."""
-        with torch.no_grad():
-            return self.draw(state, frames, generator, temperature=temperature, planting=planting, condition=condition)
+        """Draw frames one after the other (section 4.1.4); temperature scales the Gaussians' sigmas, with `sigma_speed`
+        each frame is drawn given that toes stand where its bits are 1 (see `condition_on_standing`), and `condition` is
+        as in `forward`. Without gradient, unless `differentiable` in the weights for the drawn components and bits."""
+        with torch.set_grad_enabled(differentiable and torch.is_grad_enabled()):
+            return self._draw(state, frames, generator, temperature, sigma_speed, condition)
 
-    def draw(
+    def _draw(
         self,
         state: LstmState,
         frames: int,
         generator: torch.Generator,
-        *,
-        temperature: float = 1.0,
-        planting: Planting | None = None,
-        condition: Float[Tensor, "batch conditions"] | None = None,
-    ) -> tuple[Float[Tensor, "batch frames size"], LstmState]:
-        """`sample`, differentiable in the weights for the components and bits that were drawn."""
+        temperature: float,
+        sigma_speed: float | None,
+        condition: Tensor | None,
+    ) -> tuple[Tensor, LstmState]:
         drawn, device, cholesky = [], self.mean.device, self.cholesky
-        there, size = generator.device, self.layout.continuous
+        there, size = generator.device, LAYOUT.continuous
         for _ in range(frames):
             mixture, state = self._step(state, condition)
             weights = mixture.log_weight.detach().exp().to(there)
@@ -363,9 +342,9 @@ class LstmGmm(nn.Module):
             planted = torch.sigmoid(mixture.contact_logit.detach())  # probability
             bits = torch.rand(planted.shape, generator=generator, device=there).to(device) < planted
             frame, _ = self._compose(mixture, component, noise, bits, cholesky)
-            if planting is not None:
+            if sigma_speed is not None:
                 gaussian = self._find_gaussian(mixture, component, cholesky, temperature)
-                frame = planting.condition(state.last_frame, frame, *gaussian, generator)
+                frame = condition_on_standing(sigma_speed, state.last_frame, frame, *gaussian, generator)
             state = LstmState(frame, state.hidden, state.cell)
             drawn.append(frame)
         return torch.stack(drawn, dim=1), state
@@ -406,17 +385,23 @@ class LstmGmm(nn.Module):
         Of each frame's components, the one that explains it best.
         """
         with torch.no_grad():
-            before = torch.cat([state.last_frame.unsqueeze(1), features[:, :-1]], dim=1)
-            mixture, _ = self(self.normalise(before), (state.hidden, state.cell))
-            error = self._target(features)[..., : self.layout.continuous].unsqueeze(-2) - mixture.mean
+            mixture, _ = self._predict(state, features)
+            error = self._target(features)[..., : LAYOUT.continuous].unsqueeze(-2) - mixture.mean
             if (inverse_cholesky := self.inverse_cholesky) is not None:
                 error = torch.einsum("kij,...kj->...ki", inverse_cholesky, error)
             noise = error * torch.exp(-mixture.log_sigma)
             each = mixture.log_weight - mixture.log_sigma.sum(-1) - 0.5 * noise.square().sum(-1)
             component = each.argmax(-1)
             chosen = component[..., None, None].expand(*component.shape, 1, noise.shape[-1])
-            bits = self.layout.pick(features, "contacts") > 0.5
+            bits = LAYOUT.pick(features, "contacts") > 0.5
             return DiscreteChoices(component, bits), noise.gather(-2, chosen)[..., 0, :]
+
+    def _predict(
+        self, state: LstmState, frames: Tensor, condition: Tensor | None = None
+    ) -> tuple[Mixture, tuple[Tensor, Tensor]]:
+        """Mixtures of each of the frames given those before it, and the memory before the last is seen."""
+        before = torch.cat([state.last_frame.unsqueeze(1), frames[:, :-1]], dim=1)
+        return self(self.normalise(before), (state.hidden, state.cell), condition=condition)
 
     def _step(self, state: LstmState, condition: Tensor | None = None) -> tuple[Mixture, LstmState]:
         inputs = self.normalise(state.last_frame).unsqueeze(1)
@@ -435,7 +420,7 @@ class LstmGmm(nn.Module):
         """One frame (physical units) of the chosen component and bits, and its log density."""
         row = torch.arange(len(component))
         mean, log_sigma = mixture.mean[row, component], mixture.log_sigma[row, component]
-        size = self.layout.continuous
+        size = LAYOUT.continuous
         spread = torch.exp(log_sigma) * noise
         if cholesky is not None:
             spread = torch.einsum("bij,bj->bi", cholesky[component], spread)
@@ -450,12 +435,12 @@ class LstmGmm(nn.Module):
         self, mixture: Mixture, component: Int[Tensor, " batch"], cholesky: Tensor | None, temperature: float
     ) -> tuple[Float[Tensor, "batch continuous"], Float[Tensor, "batch continuous continuous"]]:
         """Mean of the chosen components and a factor of their covariance, physical units."""
-        row, size = torch.arange(len(component)), self.layout.continuous
+        row, size = torch.arange(len(component)), LAYOUT.continuous
         sigma = temperature * torch.exp(mixture.log_sigma[row, component])
         factor = torch.diag_embed(sigma) if cholesky is None else cholesky[component] * sigma[:, None]
         mean = mixture.mean[row, component] * self.std[:size] + self.mean[:size]
         return mean, self.std[:size, None] * factor
 
     def _target(self, features: Tensor) -> Tensor:
-        size = self.layout.continuous
+        size = LAYOUT.continuous
         return torch.cat([self.normalise(features)[..., :size], features[..., size:]], dim=-1)

@@ -106,7 +106,7 @@ def run_free(
     if away > 0:
         wandered, state = model.sample(state, away, generator, condition=condition)
         past = torch.cat([past, wandered], 1)
-    generated, _ = model.draw(state, max(frames, least), generator, condition=condition)
+    generated, _ = model.sample(state, max(frames, least), generator, condition=condition, differentiable=True)
     real = windows[:, context - PAST_FRAMES : context + frames]
     return torch.cat([past[:, -PAST_FRAMES:], generated], 1), real
 

@@ -19,7 +19,7 @@ from mapctl.skeleton import TOE_JOINTS
 from priors.checkpoints import Card
 from priors.lstm_gmm import density
 from priors.lstm_gmm.density import LstmGmmDensity
-from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig, LstmState, Planting
+from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig, LstmState, condition_on_standing
 from priors.training.recipes.lstm_gmm import DensityTrainer, compute_feature_statistics, select_initial_states
 
 SIZE = LAYOUT.continuous
@@ -198,7 +198,7 @@ def condition(before, mean, factor, *, bits=(1.0, 1.0), count=1, seed=0):
     noise = torch.randn(count, SIZE, generator=generator(seed))
     sample = torch.cat([mean + noise @ factor.T, torch.tensor(bits).expand(count, 2)], dim=-1)
     rows = (before.expand(count, -1), sample, mean.expand(count, -1), factor.expand(count, -1, -1))
-    return sample, Planting(SIGMA).condition(*rows, generator(seed + 1))
+    return sample, condition_on_standing(SIGMA, *rows, generator(seed + 1))
 
 
 @pytest.mark.slow
@@ -229,8 +229,8 @@ def test_a_density_samples_so(monkeypatch):
     assert not torch.allclose(one, plain)
     # Nothing is random about a toe without noise: the frames_of_planting are the means.
     cold, mean = (
-        density.reference.sample(state, 20, generator(3), temperature=0.0, planting=planting)[0]
-        for planting in (Planting(SIGMA), None)
+        density.reference.sample(state, 20, generator(3), temperature=0.0, sigma_speed=sigma)[0]
+        for sigma in (SIGMA, None)
     )
     assert torch.allclose(cold[:, 0], mean[:, 0], atol=1e-6)
 

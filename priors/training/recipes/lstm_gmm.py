@@ -353,7 +353,7 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
 
     def _log_prob(self, windows: Tensor, shown: Tensor) -> Tensor:
         """Log density of frames 1.. given noisy frames 0..: noise is on the inputs only (section 4.1.3)."""
-        model, size = self.network, self.network.layout.continuous
+        model, size = self.network, LAYOUT.continuous
         inputs, level = self._add_noise(model.normalise(windows[:, :-1]), size)
         memory = model.start_after(windows[:, 0])
         condition = self._make_condition(level, shown)
