@@ -39,6 +39,7 @@ from mapctl.retarget.character import (
     Stance,
     limb_extension,
     limb_lengths,
+    rotate_foot_frames,
 )
 from mapctl.retarget.hands import Spans, hold_through, keep_hand_relations, mean_by_span, merge_contacts, soft_clamp
 from mapctl.retarget.rigs import Rig
@@ -337,8 +338,9 @@ def retarget_canonical(
     than those of `GroundMode`."""
     if ground not in get_args(GroundMode):
         raise RequestError(f"the ground is one of {', '.join(get_args(GroundMode))}, got {ground!r}")
-    source = replace(source, stance=source.stance.keep_floor()) if ground == "keep" else source
-    own = source.stance.leveled(motion)
+    if ground == "keep":
+        source = replace(source, stance=source.stance.keep_floor(source.skeleton))
+    own = rotate_foot_frames(motion, -source.stance.tilt)
     scale = leg_length(body.leveled) / leg_length(own.skeleton)
     spans, height = find_ground(own, source.stance)
     higher = 1 - scale if ground == "keep" else 0.0
@@ -356,7 +358,7 @@ def retarget_canonical(
         feet_missed=Miss.of((done.joint_positions()[:, FEET] - ankles).norm(dim=-1), _FOOT_METRES),
         hands_missed=Miss.of(hands_off, _HAND_METRES),
     )
-    return RetargetedMotion(body.stance.restore_foot_tilt(done), changes)
+    return RetargetedMotion(rotate_foot_frames(done, body.stance.tilt), changes)
 
 
 def _carry_fingers(
