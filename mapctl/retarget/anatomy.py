@@ -207,8 +207,7 @@ class _Builder:
         return bend > max(_MIN_BEND, _HINGE_SHARE * float(normals.norm(dim=-1).mean()))
 
     def orient(self, name: str, first: Vectors, aim: Tensor, second: Vectors, aim_second: Tensor) -> None:
-        """Give a joint the frame in which the first direction is its canonical one, and the second as nearly so as
-        that allows."""
+        """Give a joint the frame in which the first direction is its canonical one, and the second nearly so."""
         one, two = unit_vectors(self.average(name, first)), unit_vectors(self.average(name, second))
         target = orthonormal_frame(aim, aim_second)
         self.measured[name] = self.frames[name] = target @ orthonormal_frame(one, two).T
@@ -343,8 +342,7 @@ def _leg_extension(clip: RigPoses, side: str) -> tuple[Vectors, Float[Tensor, "p
 
 
 def _estimate_foot_pitch(clip: RigPoses, upright: Tensor | None) -> float:
-    """Estimate how far the bones of the feet point below level while they are flat, radians: the mean over frames,
-    weighted by how stretched the leg and how low the ankle is; the canonical feet's where no frame counts."""
+    """Estimate how far foot bones point below level while feet are flat, radians; the canonical ones' by default."""
     _, y, z = unit_vectors(CANONICAL.offsets[CANONICAL.index("leftToes")]).tolist()
     up = _Y if upright is None else rotations.rotate(rotations.inverse(upright), _Y)
     total, weights = math.atan2(-y, z) * _PITCH_WEIGHT, _PITCH_WEIGHT

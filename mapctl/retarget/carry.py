@@ -287,7 +287,7 @@ def reach_ankle_targets(moved: Motion, ankles: Float[Tensor, "frames 2 3"]) -> M
     at, most = positions[:, HIP_JOINTS], _MAX_EXTENSION * limb_lengths(moved.skeleton, LEGS)
     to_ankles = ankles - at
     far = to_ankles.norm(dim=-1)
-    positions[:, FEET] = at + to_ankles * (soft_clamp(far, most, _SOFT_MARGIN) / far.clamp_min(1e-9))[..., None]
+    positions[:, FEET] = at + to_ankles * (soft_clamp(far, most, _SOFT_MARGIN * most) / far.clamp_min(1e-9))[..., None]
     free = torch.zeros(positions.shape[:2], dtype=torch.bool)
     free[:, [*HIP_JOINTS, *SHINS]] = True
     local = inverse.solve_inverse_kinematics(
@@ -364,8 +364,8 @@ def retarget_canonical(
 def _carry_fingers(
     clip: Motion, source: RigMap, body: RigMap, pairs: Mapping[int, int]
 ) -> Mapping[int, Float[Tensor, "frames 4"]]:
-    """Return the local rotations (xyzw) of the body's finger joints that turn as the source's do, by joint of its rig;
-    in the T-poses of both rigs, fingers are taken to point along the same direction."""
+    """Return local rotations (xyzw) of the body's fingers that turn as the source's, by joint of its rig; in the
+    T-poses of both, fingers are taken to point along the same direction."""
     ours, theirs = body.rest_quat_xyzw, source.rest_quat_xyzw
     found = {}
     for joint, other in pairs.items():

@@ -153,8 +153,7 @@ def _detect_flat_feet(clip: Motion) -> Bool[Tensor, "frames 2"]:
 
 
 def _estimate_tilt(clip: Motion, flat: Bool[Tensor, "frames 2"]) -> Float[Tensor, "2 2"]:
-    """Estimate the tilt of foot and toes by side, radians: its median over the frames in which the foot is flat; 0 for
-    a side that has none."""
+    """Estimate the tilt of foot and toes by side, radians: its median over flat frames; 0 for a side without any."""
     forward = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     turns = clip.joint_rotations()[:, [*FEET, *TOES]].reshape(-1, 2, 2, 4)
     up = torch.asin(rotations.rotate(turns, forward.expand(*turns.shape[:3], 3))[..., 1].clamp(-1, 1))
