@@ -79,13 +79,10 @@ class View:
         return np.stack([right, down, depth], axis=-1)
 
 
-def look_at(eye: Array, target: Array, up: Array = _UP) -> Array:
-    """Return the (4, 4) camera-to-world pose at `eye`; straight up or down the picture's top is -Z."""
+def look_at(eye: Array, target: Array) -> Array:
+    """Return the (4, 4) camera-to-world pose at `eye`, which is not right over or under the target."""
     back = unit(np.asarray(eye, float) - target)
-    right = np.cross(up, back)
-    if np.linalg.norm(right) < 1e-6:
-        right = np.cross(np.array([0.0, 0.0, -1.0]), back)
-    right = unit(right)
+    right = unit(np.cross(_UP, back))
     pose = np.eye(4)
     pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
     pose[:3, 3] = eye

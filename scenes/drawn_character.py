@@ -20,42 +20,25 @@ _SAME_BONE = 1e-4  # metres by which bones of one character may differ between f
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
-    """A motion on a character's joints."""
-
-    motion: Motion
-    """On the joints of the character's file."""
-    bones: Motion
-    """The same on joints that are recognised: canonical ones, or the file's where they are all that is known."""
-    notes: tuple[str, ...] = ()
-    """Parts of the motion that could not be kept."""
-
-
-@dataclass(frozen=True, eq=False)
 class DrawnMotion:
     """A motion put on a character, to be filmed."""
 
     mesh: CharacterMesh
     """Triangles of the character."""
-    placed: Placed
-    """The motion on the character's joints."""
-    convert: Callable[[Motion], Placed]
-    """Puts further frames of the same source on it, as poses that are requested."""
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Parts of the motion that could not be kept, one sentence each."""
-        return self.placed.notes
+    motion: Motion
+    """The motion on the joints of the character's file."""
+    bones: Motion
+    """The same on joints that are recognised: canonical ones, or the file's where they are all that is known."""
+    notes: tuple[str, ...]
+    """Parts of the motion that could not be kept, one sentence each."""
+    put_on: Callable[[Motion], "DrawnMotion"]
+    """Puts further frames of the same source on the character, as poses that are requested."""
 
     def build_body(self, fps: Fraction, colour: Array) -> SkinnedBody:
         """Build the body at a film's rate; `colour` is that of its bones (red, green, blue, 0 to 1), where these are
         drawn."""
-        bones = replace(self.placed.bones, source=None).resample(fps)
-        return SkinnedBody(self.mesh, self.placed.motion.resample(fps), Mannequin(bones, colour))
-
-    def build_pose(self, pose: Motion, colour: Array) -> SkinnedBody:
-        """Build the body in one frame of the source's skeleton; `colour` as of `build_body`."""
-        return replace(self, placed=self.convert(pose)).build_body(pose.fps, colour)
+        bones = replace(self.bones, source=None).resample(fps)
+        return SkinnedBody(self.mesh, self.motion.resample(fps), Mannequin(bones, colour))
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,27 +82,32 @@ class DrawnCharacter:
         are retargeted (mapctl.retarget.carry), as by `mapctl convert --rig`. RequestError where the joints of either
         cannot be identified.
         """
-        convert = self._choose_conversion(motion)
-        return DrawnMotion(self.mesh, convert(motion), convert)
+        place = self._choose_conversion(motion)
 
-    def _choose_conversion(self, motion: Motion) -> Callable[[Motion], Placed]:
+        def put_on(own: Motion) -> DrawnMotion:
+            return DrawnMotion(self.mesh, *place(own), put_on)
+
+        return put_on(motion)
+
+    def _choose_conversion(self, motion: Motion) -> Callable[[Motion], tuple[Motion, Motion, tuple[str, ...]]]:
+        """Choose what puts such a motion on the character: on its own joints, on recognised ones, and with notes."""
         if motion.skeleton.matches(self.standing.skeleton, _SAME_BONE):
             return _keep
         for rigmap in (self.body.leveled_map, self.body.rigmap):
             if motion.skeleton.matches(rigmap.skeleton, _SAME_BONE):
-                return lambda own: Placed(replace(from_canonical(own, rigmap), source=self.standing.source), own)
+                return lambda own: (replace(from_canonical(own, rigmap), source=self.standing.source), own, ())
         source = RiggedCharacter.of(motion)[1]
 
-        def retarget(part: Motion) -> Placed:
+        def retarget(part: Motion) -> tuple[Motion, Motion, tuple[str, ...]]:
             done = retarget_canonical(to_canonical(part, as_rig(source.rigmap))[0], source, self.body)
-            return Placed(self.body.on_rig(done.motion), done.motion, done.notes)
+            return self.body.on_rig(done.motion), done.motion, done.notes
 
         return retarget
 
 
-def _keep(motion: Motion) -> Placed:
+def _keep(motion: Motion) -> tuple[Motion, Motion, tuple[str, ...]]:
     upright = put_upright(motion)[0]
     try:
-        return Placed(upright, to_canonical(upright)[0])
+        return upright, to_canonical(upright)[0], ()
     except RequestError:  # a creature, whose joints are drawn all the same
-        return Placed(upright, upright)
+        return upright, upright, ()

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cache
 from types import ModuleType
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal
 
 import numpy as np
 
@@ -77,17 +77,6 @@ def blend_veils(plain: Array, covered: Array) -> Array:
     Triangles and lines that are blended one by one would show what is within a body.
     """
     return np.rint(colours.blend_colours(plain.astype(np.float32), covered, _VEIL_OPACITY)).astype(np.uint8)
-
-
-@runtime_checkable
-class Painter(Protocol):
-    """Turns content into pixels."""
-
-    name: str
-
-    def paint(self, view: View, content: Content) -> Array:
-        """Paint (height, width, 3) uint8."""
-        ...
 
 
 _OPAQUE = 0.999
@@ -228,7 +217,7 @@ _ADVICE = "For shaded bodies: pip install 'mapctl[render]', and on Debian apt-ge
 _log = logging.getLogger("mapctl.scenes")
 
 
-def select_painter(name: RendererName | None = None) -> Painter:
+def select_painter(name: RendererName | None = None) -> "Painter":
     """Select the painter of a name; None takes the one in MAPCTL_RENDERER, else `auto`.
 
     `auto` falls back to stick figures and logs one line on what is missing; `egl` raises NoGraphicsError.
@@ -237,15 +226,17 @@ def select_painter(name: RendererName | None = None) -> Painter:
     wanted = name or os.environ.get(RENDERER_VARIABLE) or "auto"
     if wanted not in ("auto", "egl", "stick"):
         raise RequestError(f"the renderer must be auto, egl or stick, got {wanted!r}")
-    if wanted == "stick":
-        return _make_stick_painter()
+    if wanted != "stick":
+        try:
+            return OffscreenPainter()
+        except NoGraphicsError as error:
+            if wanted == "egl":
+                raise
+            _log.warning("%s; drawing stick figures. %s", error, _ADVICE)
     try:
-        return OffscreenPainter()
-    except NoGraphicsError as error:
-        if wanted == "egl":
-            raise
-        _log.warning("%s; drawing stick figures. %s", error, _ADVICE)
-        return _make_stick_painter()
+        return StickPainter()
+    except ImportError as error:
+        raise RequestError(f"films need matplotlib or pyrender ({error}): pip install 'mapctl[render]'") from error
 
 
 def back_end() -> str:
@@ -254,13 +245,6 @@ def back_end() -> str:
         return select_painter("egl").name
     except NoGraphicsError as error:
         return f"{STICK_FIGURES}: {error}"
-
-
-def _make_stick_painter() -> Painter:
-    try:
-        return StickPainter()
-    except ImportError as error:
-        raise RequestError(f"films need matplotlib or pyrender ({error}): pip install 'mapctl[render]'") from error
 
 
 _NEAR = 0.1
@@ -311,6 +295,10 @@ class StickPainter:
     def _shoot(self, view: View) -> Array:
         self._canvas.draw()
         return np.asarray(self._canvas.buffer_rgba())[: view.height, : view.width, :3].copy()
+
+
+Painter = OffscreenPainter | StickPainter
+"""What turns content into pixels."""
 
 
 def _draw_flat(axes, view: View, surface: Surface) -> None:

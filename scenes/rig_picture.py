@@ -103,8 +103,7 @@ def _draw_body(axes: Any, rigmap: RigMap, fit: Fit, flat: Float[np.ndarray, "joi
 
 
 def _draw_labels(axes: Any, rigmap: RigMap, fit: Fit, positions: JointPositions) -> None:
-    """Write both names of each canonical joint in a column at either edge, from the highest joint to the lowest, with a
-    line to the joint; those of the left arm and leg and of the trunk stand right, as the body is seen."""
+    """Write both names of each joint, highest first, at the edges: those of left limbs and the trunk right, as seen."""
     names = rigmap.rig_skeleton.names
     for on_right in (False, True):
         own = [

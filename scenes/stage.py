@@ -104,10 +104,12 @@ class Stage:
         self.fps = Fraction(fps or shots[0].motion.fps).limit_denominator(100_000)
         self.players = [_prepare_actor(shot, k, len(shots), self.fps) for k, shot in enumerate(shots)]
         self.num_frames = max(p.start + p.body.num_frames for p in self.players)
-        self._grid = overlays.build_grid(self._collect_points()[:, [0, 2]])
-        targets = [player.target for player in self.players if player.target is not None]
         self._veils = [figure for player in self.players for figure in player.poses]
-        self._still = merge_surfaces([self._grid, *targets, *props])
+        targets = [player.target for player in self.players if player.target is not None]
+        self._curves = [target.vertices for target in targets]
+        paths = [player.body.anatomy.hips_world for player in self.players]
+        grid = overlays.build_grid(np.concatenate([*paths, *self._curves])[:, [0, 2]])
+        self._still = merge_surfaces([grid, *targets, *props])
 
     @property
     def seconds(self) -> float:
@@ -145,15 +147,8 @@ class Stage:
         hips = [p.body.anatomy.hips_world[i] for p, i in zip(self.players, index, strict=True)]
         seen = np.concatenate(bodies, axis=1)
         if settings.kind != "follow":
-            positions = [p.target.vertices for p in self.players if p.target is not None]
-            still = np.concatenate([seen.reshape(-1, 3), *positions])
-            seen = still[None]
+            seen = np.concatenate([seen.reshape(-1, 3), *self._curves])[None]
         return compute_views(settings, seen, np.mean(hips, axis=0), fps=float(self.fps), size=size)
-
-    def _collect_points(self) -> Array:
-        """Return (n, 3) positions where anything happens, metres, for the grid."""
-        paths = [p.body.anatomy.hips_world for p in self.players]
-        return np.concatenate([*paths, *(p.target.vertices for p in self.players if p.target is not None)])
 
 
 def _prepare_actor(shot: Shot, number: int, count: int, fps: Fraction) -> StagedActor:
@@ -210,7 +205,7 @@ def _build_figures(poses: Sequence[Motion], motion: Motion, drawn: DrawnMotion |
     if not poses:
         return []
     if drawn is not None:
-        bodies = [drawn.build_pose(pose, colours.rgb(colours.TARGET)) for pose in poses]
+        bodies = [drawn.put_on(pose).build_body(pose.fps, colours.rgb(colours.TARGET)) for pose in poses]
         return [Figure(body, 0, _TINT, toward=colours.TARGET, shell=_SHELL) for body in bodies]
     # A body's shoes are as its whole motion shows them flat; a pose alone may stand on its toes.
     whole = reduce(lambda joined, pose: joined.join(replace(pose, fps=motion.fps)), poses, motion)

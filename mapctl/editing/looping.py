@@ -11,6 +11,7 @@ degree. Footing then holds planted toes still and on the floor by the legs, wher
 
 import math
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 import torch
@@ -42,9 +43,7 @@ _NOISE_SPEED = 0.04  # m/s that noise of toes makes once they are smoothed, befo
 _SMOOTH_SECONDS = (0.04, 0.15)  # least and greatest standard deviation of that Gaussian
 _MERGE_SECONDS, _MERGE_METRES = 0.15, 0.06  # contacts at one position with less than these between them are one
 _ROLL_METRES = 0.005  # over its usual height in a contact, from which a planted toe is moving down or up
-_STEP_FADE_SECONDS = (
-    0.12  # over which a foot comes to its position and leaves it: a swing foot is moved as little as that
-)
+_STEP_FADE_SECONDS = 0.12  # over which a foot comes to its position and leaves it: a swing foot moves that little
 
 
 def plant_feet(motion: Motion, rig: Rig | None = None, cycle: GroundTransform | None = None) -> Motion:
@@ -120,11 +119,9 @@ def correct_toes(
 
 
 def _choose_smoothing(toes: Float[Tensor, "frames 2 3"], fps: float) -> float:
-    """Choose the standard deviation in frames of the Gaussian that leaves so little of the noise.
-
-    Noise is estimated by third differences, of which white noise of 1 makes 20 in the square; most frames have little
-    else. Of it a Gaussian of s frames leaves velocities of (4 sqrt(pi) s^3)^-1/2 a frame.
-    """
+    """Choose the standard deviation in frames of the Gaussian that leaves so little of the noise."""
+    # White noise of 1 makes third differences of 20 in the square; most frames have little else. Of it a Gaussian of s
+    # frames leaves velocities of (4 sqrt(pi) s^3)^-1/2 a frame.
     least, most = (seconds * fps for seconds in _SMOOTH_SECONDS)
     if len(toes) < _NOISE_FRAMES:
         return least
@@ -232,8 +229,7 @@ def describe_cycle(motion: Motion, cycle: Cycle) -> dict[str, float | int | bool
 
 
 def _describe_frames(motion: Motion, step: int) -> Float[Tensor, "frames joints 6"]:
-    """Describe each frame by joint positions from below the hips, which face +Z, and velocities (times 0.1 s) over
-    `step` frames on both sides, metres."""
+    """Describe frames by joint positions from below the hips, which face +Z, and velocities (times 0.1 s), metres."""
     back = -rotations.split_heading(motion.joint_rotations()[:, 0])[0][:, None]
     frames = torch.arange(motion.num_frames)
     before, after = (frames - step).clamp(min=0), (frames + step).clamp(max=motion.num_frames - 1)
@@ -254,8 +250,7 @@ def _measure_distance(
 def _find_periods(
     distances: Float[Tensor, "lags frames"], moving: Bool[Tensor, "lags frames"], lags: range
 ) -> list[int]:
-    """Find the lags at which moving frames come back, the shortest first: where the mean distance is a local minimum,
-    clearly under the mean of all."""
+    """Find the lags at which the mean distance of moving frames has a clear local minimum, the shortest first."""
     profile = torch.where(moving, distances, 0.0).sum(dim=1) / moving.sum(dim=1)
     usual = profile.nanmean()
     return [
@@ -277,12 +272,10 @@ def _cover_steps(motion: Motion, step: int, lags: range) -> Bool[Tensor, "lags f
 
 def _refine(motion: Motion, states: Tensor, start: int, stop: int, step: int, periodic: bool) -> Cycle:
     """Choose the two frames around a pair that are most alike, at the clip's own rate."""
-    near = range(-step + 1, step)
-    starts = [f for f in (start + d for d in near) if f >= 0]
-    stops = [f for f in (stop + d for d in near) if f < motion.num_frames]
-    distance, start, stop = min(
-        (float(_measure_distance(states[one], states[other])), one, other) for one in starts for other in stops
-    )
+    starts = range(max(0, start - step + 1), start + step)
+    stops = range(stop - step + 1, min(motion.num_frames, stop + step))
+    pairs = product(starts, stops)
+    distance, start, stop = min((float(_measure_distance(states[a], states[b])), a, b) for a, b in pairs)
     steps = motion.root_position[start : stop + 1, ::2].diff(dim=0).norm(dim=-1)
     return Cycle(start, stop, distance, periodic, float(steps.mean()) * float(motion.fps))
 
@@ -382,10 +375,8 @@ def _close(still: Motion, start: int, frames: int, reach: int, fps: float) -> Mo
 
 
 def _spread(apart: Float[Tensor, "window width"], at: int, frames: int, fps: float) -> Float[Tensor, "frames width"]:
-    """Return offsets of a cycle's frames which take away by what its ends are apart, half at each end.
-
-    `apart` is how far the end is from the beginning in the frames around the seam, which is frame `at` of them.
-    """
+    """Return offsets of a cycle's frames that close its seam, half at each end; `apart` is how far the end is from the
+    beginning in the frames around the seam, which is frame `at` of them."""
     seconds = (torch.arange(len(apart)) - at).double().numpy() / fps
     degree = min(2, len(apart) - 1)
     powers = np.vander(seconds, degree + 1, increasing=True)
@@ -407,8 +398,7 @@ def _spread(apart: Float[Tensor, "window width"], at: int, frames: int, fps: flo
 def _restore_contacts(
     closed: RiggedMotion, source: RiggedMotion, planted: Bool[Tensor, "frames 2"], travel: GroundTransform
 ) -> Motion:
-    """Remove from planted feet the drift that closing the cycle adds; over the seam too. `source` are the same
-    frames before, and one more."""
+    """Remove from planted feet the drift that closing adds; `source` are the same frames before, and one more."""
     if not bool(planted.any()):
         return closed.motion
     frames = closed.motion.num_frames

@@ -91,8 +91,7 @@ def mirror(motion: Motion, rig: Rig | None = None) -> Motion:
 
 
 def _mirror_joints(rigged: RiggedMotion) -> Motion:
-    """Mirror all rotations, travelling joints and the position of the hips. Joints without a partner keep their own
-    local rotation."""
+    """Mirror rotations, travelling joints and the hips; joints without a partner keep their own local rotation."""
     motion, partners, rest = rigged.motion, pair_joints(rigged.rigmap), rigged.rigmap.rest_quat_xyzw
     world = motion.joint_rotations()
     index = torch.tensor([joint if partner is None else partner for joint, partner in enumerate(partners)])

@@ -17,6 +17,7 @@ from mapctl.motion import Motion
 from mapctl.numerics import gaussian
 from mapctl.retarget import RigMap
 from mapctl.retarget.character import SIDES
+from mapctl.retarget.hands import soft_clamp
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL
 
@@ -159,8 +160,7 @@ def _turn_leg(
     # As far as it is wanted, and ever less beyond what is nearly the most. A leg that was straighter may stay so.
     wanted, length = target.norm(dim=-1), upper + lower
     most, soft = torch.maximum(_MAX_EXTENSION * length, whole), _SOFT_SHARE * length
-    over = (wanted - (most - soft)).clamp_min(0)
-    limited = torch.minimum(wanted, most - soft) + soft * (1 - torch.exp(-over / soft))
+    limited = soft_clamp(wanted, most, soft)
     far = torch.where(wanted <= whole, wanted, torch.maximum(limited, torch.minimum(whole, wanted)))
     swing = rotations.between_vectors(thigh + shin, target)
     axis = torch.nn.functional.normalize(target, dim=-1)

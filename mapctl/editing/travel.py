@@ -175,8 +175,7 @@ def move_travel_to_root(motion: Motion, rig: Rig | None = None, cycle: GroundTra
 def _find_travel(
     rigged: RiggedMotion, cycle: GroundTransform | None = None
 ) -> tuple[Float[Tensor, "frames 2"], Float[Tensor, " frames"]]:
-    """Find the travel of a motion, or of a loop with this travel by cycle: positions over the ground, metres, and
-    headings, radians about +Y, not wrapped."""
+    """Find the travel of a motion, or of a loop: positions over the ground, metres, and headings, not wrapped."""
     hips = rigged.position("hips")[:, ::2]
     heading = rotations.unwrap_angle(rotations.split_heading(rigged.canonical.joint_rotations()[:, 0])[0])
     if cycle is None:

@@ -18,12 +18,16 @@ from mapctl.numerics.intervals import true_intervals
 USUAL_SPEED = 1.2
 """m/s, of walks that are requested without a speed."""
 _SUBSTEPS = 10  # integration steps a frame
+_SLOWEST_SHARE = 0.6  # of the requested speeds, to which they are lowered at most
 
 
-def _check_speeds(name: str, at: tuple[float, ...], speeds: tuple[float, ...]) -> None:
+def _check_speeds(name: str, at: tuple[float, ...], speeds: tuple[float, ...], *, may_stand: bool) -> None:
     rises = all(a < b for a, b in pairwise(at))
     if not at or len(at) != len(speeds) or not rises or not all(map(math.isfinite, at)):
         raise RequestError(f"speeds need as many {name}, which rise, got {at} and {speeds}")
+    for speed in speeds:
+        if not (0 < speed < math.inf or (may_stand and speed == 0)):
+            raise RequestError(f"speed must be {'zero or ' if may_stand else ''}positive, got {speed:g} m/s")
 
 
 @dataclass(frozen=True)
@@ -36,10 +40,7 @@ class SpeedProfile:
     """Speeds at those arcs, m/s, positive."""
 
     def __post_init__(self):
-        _check_speeds("arcs", self.arcs, self.speeds)
-        for speed in self.speeds:
-            if not 0 < speed < math.inf:
-                raise RequestError(f"speed must be positive, got {speed:g} m/s")
+        _check_speeds("arcs", self.arcs, self.speeds, may_stand=False)
 
     @staticmethod
     def constant(speed: float) -> "SpeedProfile":
@@ -96,17 +97,15 @@ class PathRequest:
             )
         return max(2, round(count))
 
-    def fitted(self, fps: float, *, slowest_share: float = 0.6) -> tuple["PathRequest", str | None]:
-        """Lower speeds so that an open curve lasts for the whole duration; also return a note if any was lowered.
-
-        Speeds are lowered to `slowest_share` of the requested ones at most; what is then left goes on straight.
-        """
+    def fitted(self, fps: float) -> tuple["PathRequest", str | None]:
+        """Lower speeds so that an open curve lasts for the whole duration, to 60 % of the requested ones at most: what
+        is then left goes on straight. Also return a note if any was lowered."""
         if self.seconds is None or self.curve.closed:
             return self, None
         wanted = float(self.arcs(self.frames(fps), fps)[-1])
         if wanted <= self.curve.length + 0.01:
             return self, None
-        share = max(slowest_share, self.curve.length / wanted)
+        share = max(_SLOWEST_SHARE, self.curve.length / wanted)
         slower = SpeedProfile(self.profile.arcs, tuple(v * share for v in self.profile.speeds))
         note = (
             f"the wanted speed would go {wanted:.1f} m in {self.seconds:.1f} s but the curve is "
@@ -150,10 +149,7 @@ class TimedSpeed:
     """Speeds at those times, m/s; zero is to stand."""
 
     def __post_init__(self):
-        _check_speeds("times", self.seconds, self.speeds)
-        for speed in self.speeds:
-            if not 0 <= speed < math.inf:
-                raise RequestError(f"speed must be zero or positive, got {speed:g} m/s")
+        _check_speeds("times", self.seconds, self.speeds, may_stand=True)
 
     @staticmethod
     def parse(pairs: tuple[tuple[float, float], ...]) -> "TimedSpeed":
@@ -187,14 +183,11 @@ _BRAKING = 0.9  # m/s^2, before a corner and after it
 def walk_at_ease(curve: Curve) -> SpeedProfile:
     """Return the speeds of a walk for which none is given: USUAL_SPEED, and lower before and in corners that turn
     faster than walking people do."""
-    profile = SpeedProfile.constant(USUAL_SPEED)
-    count = max(2, round(curve.length / _STEP) + 1)
-    arcs = torch.linspace(0, curve.length, count, dtype=torch.float64)
-    wanted = torch.tensor([profile.at(arc) for arc in arcs.tolist()], dtype=torch.float64)
+    arcs = torch.linspace(0, curve.length, max(2, round(curve.length / _STEP) + 1), dtype=torch.float64)
     limit = _limit_speeds(curve, arcs)
-    if bool((wanted <= limit).all()):
-        return profile
-    speeds, step = torch.minimum(wanted, limit).tolist(), float(arcs[1])
+    if bool((limit >= USUAL_SPEED).all()):
+        return SpeedProfile.constant(USUAL_SPEED)
+    speeds, step = limit.clamp(max=USUAL_SPEED).tolist(), float(arcs[1])
     for _ in range(2 if curve.closed else 1):  # what is before a loop's first corner is its end
         braked = _limit_rise(speeds[::-1], step)[::-1]
         speeds = _limit_rise(braked, step)
@@ -225,7 +218,6 @@ def _heading(curve: Curve, arcs: Float[Tensor, " arcs"]) -> Float[Tensor, " arcs
 
 def _limit_speeds(curve: Curve, arcs: Float[Tensor, " arcs"]) -> Float[Tensor, " arcs"]:
     """Return the speed, m/s, at which the curve turns no faster than people do."""
-
     # Two halves, so that a hairpin's half turn is not taken for none.
     turned = rotations.wrap_angle(_heading(curve, arcs) - _heading(curve, arcs - _AHEAD)).abs()
     turned = turned + rotations.wrap_angle(_heading(curve, arcs + _AHEAD) - _heading(curve, arcs)).abs()

@@ -7,7 +7,7 @@ so the result does not depend on how a file orients its joint axes, nor on what 
 
 import math
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations, product
 
@@ -79,15 +79,6 @@ class RigPoses:
         """Return the vector from the right joint of a part to the left, metres."""
         return self.position("left" + part) - self.position("right" + part)
 
-    def end(self, name: str) -> Float[Tensor, "poses 3"] | None:
-        """Return the position of the End Site of a canonical joint, metres, if there is one of some length."""
-        joint = self.joint_of[CANONICAL.index(name)]
-        site = self.skeleton.end_offsets.get(self.skeleton.names[joint]) if joint is not None else None
-        if joint is None or site is None or max(map(abs, site)) < 1e-4:
-            return None
-        offset = torch.tensor(site, dtype=torch.float64).expand(len(self.positions), 3)
-        return self.positions[:, joint] + rotations.rotate(self.orientations[:, joint], offset)
-
     def up(self) -> Float[Tensor, "poses 3"]:
         """Return the unit vector from the thighs to the upper arms."""
         return unit_vectors(self.middle("UpperArm") - self.middle("UpperLeg"))
@@ -105,14 +96,19 @@ class RigPoses:
 
     def bone(self, name: str) -> Float[Tensor, "poses 3"] | None:
         """Return the vector, metres, from a canonical joint to the next one of its limb or trunk that the rig has, or
-        to its End Site; None where the rig lacks either end."""
+        to its End Site; None where the rig lacks either end, or the End Site is where the joint is."""
         if not self.has(name):
             return None
-        following = next_joint(name)
+        following, start = next_joint(name), self.position(name)
         while following is not None and not self.has(following):
             following = next_joint(following)
-        stop = self.end(name) if following is None else self.position(following)
-        return None if stop is None else stop - self.position(name)
+        if following is not None:
+            return self.position(following) - start
+        joint = self.joint(name)
+        site = self.skeleton.end_offsets.get(self.skeleton.names[joint])
+        if site is None or max(map(abs, site)) < 1e-4:
+            return None
+        return start + rotations.rotate(self.orientations[:, joint], start.new_tensor(site).expand_as(start)) - start
 
 
 def next_joint(name: str) -> str | None:
@@ -193,6 +189,8 @@ class _Builder:
     frames: dict[str, Tensor] = field(default_factory=dict)
     measured: dict[str, Tensor] = field(default_factory=dict)
     """The same frames before they are rounded."""
+    certain: dict[str, Tensor] = field(default_factory=dict)
+    """Those of the joints that rigid offsets and bends determine, the hips by the spine."""
 
     def average(self, name: str, vectors: Vectors) -> Float[Tensor, "3"]:
         """Average world vectors in the own frame of a canonical joint's rig joint."""
@@ -209,8 +207,7 @@ class _Builder:
         return bend > max(_MIN_BEND, _HINGE_SHARE * float(normals.norm(dim=-1).mean()))
 
     def orient(self, name: str, first: Vectors, aim: Tensor, second: Vectors, aim_second: Tensor) -> None:
-        """Give a joint the frame in which the first direction is its canonical one, and the second as nearly so as
-        that allows."""
+        """Give a joint the frame in which the first direction is its canonical one, and the second nearly so."""
         one, two = unit_vectors(self.average(name, first)), unit_vectors(self.average(name, second))
         target = orthonormal_frame(aim, aim_second)
         self.measured[name] = self.frames[name] = target @ orthonormal_frame(one, two).T
@@ -225,18 +222,22 @@ class _Builder:
             near = _angle_between(self.measured[name], self.frames[above]) < CONTRADICTION
             self.frames[name] = self.frames[above] if near else self.measured[name]
 
-    def orient_joints(self, pitch: float) -> dict[str, Float[Tensor, "3 3"]]:
-        """Orient all joints, feet with this pitch while they are flat; return the frames of those that are certain."""
+    def be_certain(self, *names: str) -> None:
+        """Take the frames that joints have now as certain."""
+        self.certain |= {name: self.frames[name] for name in names}
+
+    def orient_joints(self, pitch: float) -> None:
+        """Orient all joints, feet with this pitch while they are flat."""
         clip = self.clip
         # Files disagree by 33 degrees about where the spine is over the hips: enough to show which pelvis is wrong.
         self.orient("hips", clip.side_line("UpperLeg"), _X, clip.position("spine") - clip.middle("UpperLeg"), _Y)
-        certain = {"hips": self.frames["hips"]}
-        known = [*self._orient_trunk()]
+        self.be_certain("hips")
+        self._orient_trunk()
         for side, sign in SIGNS:
-            known += [*self._orient_arm(side, sign), *self._orient_leg(side, pitch)]
-        return certain | {name: self.frames[name] for name in known}
+            self._orient_arm(side, sign)
+            self._orient_leg(side, pitch)
 
-    def _orient_trunk(self) -> Iterator[str]:
+    def _orient_trunk(self) -> None:
         clip = self.clip
         # The pelvis is up against the legs where both are stretched, else along the spine.
         (left, first), (right, second) = (_leg_extension(clip, side) for side, _ in SIGNS)
@@ -247,7 +248,7 @@ class _Builder:
         if clip.has("chest"):
             self.orient("chest", across, _X, _bone(clip, "chest", clip.up()), _Y)
             top, across = "chest", self.axis("chest", _X)
-            yield "chest"
+            self.be_certain("chest")
         self.orient("spine", _bone(clip, "spine", clip.up()), _Y, self.axis("hips", _X) + across, _X)
         for name in filter(clip.has, ("neck", "head")):
             up = self.axis(top, _Y)
@@ -257,7 +258,7 @@ class _Builder:
         if clip.has("head"):
             self.continue_frame("head", "neck")
 
-    def _orient_arm(self, side: str, sign: float) -> Iterator[str]:
+    def _orient_arm(self, side: str, sign: float) -> None:
         """Orient the joints of an arm: bones lie along x, the elbow bends toward +z."""
         clip, above = self.clip, "chest" if self.clip.has("chest") else "spine"
         shoulder, upper, lower, hand = (side + part for part in _ARM)
@@ -265,7 +266,7 @@ class _Builder:
             bone = _bone(clip, shoulder, sign * self.axis(above, _X))
             self.orient(shoulder, bone, sign * _X, self.axis(above, _Y), _Y)
             above = shoulder
-            yield shoulder
+            self.be_certain(shoulder)
         arm = _bone(clip, upper)
         forearm = _bone(clip, lower, arm)
         hinge = -sign * torch.linalg.cross(arm, forearm)
@@ -278,9 +279,9 @@ class _Builder:
             self.orient(hand, _bone(clip, hand, forearm), sign * _X, self.axis(lower, _Y), _Y)
             self.continue_frame(hand, lower)
         if bends:
-            yield upper
+            self.be_certain(upper)
 
-    def _orient_leg(self, side: str, pitch: float) -> Iterator[str]:
+    def _orient_leg(self, side: str, pitch: float) -> None:
         """Orient the joints of a leg: bones lie along -y, the knee bends toward -z, the foot is as when it is flat."""
         clip = self.clip
         upper, lower, foot, toes = (side + part for part in ("UpperLeg", "LowerLeg", "Foot", "Toes"))
@@ -291,7 +292,7 @@ class _Builder:
         self.orient(upper, thigh, -_Y, hinge, _X)
         self.orient(lower, shin, -_Y, hinge, _X)
         if bends:
-            yield from (upper, lower)
+            self.be_certain(upper, lower)
         bone, across = clip.bone(foot), self.axis(lower, _X)
         if bone is None:  # nothing but the shin shows where the foot points
             self.orient(foot, shin, -_Y, across, _X)
@@ -318,7 +319,8 @@ def estimate_frames(
     turns, pitch = rotations.to_matrix(clip.orientations), _estimate_foot_pitch(clip, upright)
     axes = torch.eye(3, dtype=turns.dtype).expand_as(turns[0]) if own is None else rotations.to_matrix(own)
     found = _Builder(clip, turns if own is None else turns @ axes)
-    certain = found.orient_joints(pitch)
+    found.orient_joints(pitch)
+    certain = found.certain
     core = [found.frames[name] for name in CORE if clip.has(name)]
     if all(_angle_between(frame, torch.stack([_nearest_axis(axis) for axis in frame])) < _ROUNDING for frame in core):
         found = _Builder(clip, found.turns, in_quarter_turns=True)
@@ -340,8 +342,7 @@ def _leg_extension(clip: RigPoses, side: str) -> tuple[Vectors, Float[Tensor, "p
 
 
 def _estimate_foot_pitch(clip: RigPoses, upright: Tensor | None) -> float:
-    """Estimate how far the bones of the feet point below level while they are flat, radians: the mean over frames,
-    weighted by how stretched the leg and how low the ankle is; the canonical feet's where no frame counts."""
+    """Estimate how far foot bones point below level while feet are flat, radians; the canonical ones' by default."""
     _, y, z = unit_vectors(CANONICAL.offsets[CANONICAL.index("leftToes")]).tolist()
     up = _Y if upright is None else rotations.rotate(rotations.inverse(upright), _Y)
     total, weights = math.atan2(-y, z) * _PITCH_WEIGHT, _PITCH_WEIGHT

@@ -39,6 +39,7 @@ from mapctl.retarget.character import (
     Stance,
     limb_extension,
     limb_lengths,
+    rotate_foot_frames,
 )
 from mapctl.retarget.hands import Spans, hold_through, keep_hand_relations, mean_by_span, merge_contacts, soft_clamp
 from mapctl.retarget.rigs import Rig
@@ -286,7 +287,7 @@ def reach_ankle_targets(moved: Motion, ankles: Float[Tensor, "frames 2 3"]) -> M
     at, most = positions[:, HIP_JOINTS], _MAX_EXTENSION * limb_lengths(moved.skeleton, LEGS)
     to_ankles = ankles - at
     far = to_ankles.norm(dim=-1)
-    positions[:, FEET] = at + to_ankles * (soft_clamp(far, most, _SOFT_MARGIN) / far.clamp_min(1e-9))[..., None]
+    positions[:, FEET] = at + to_ankles * (soft_clamp(far, most, _SOFT_MARGIN * most) / far.clamp_min(1e-9))[..., None]
     free = torch.zeros(positions.shape[:2], dtype=torch.bool)
     free[:, [*HIP_JOINTS, *SHINS]] = True
     local = inverse.solve_inverse_kinematics(
@@ -337,8 +338,9 @@ def retarget_canonical(
     than those of `GroundMode`."""
     if ground not in get_args(GroundMode):
         raise RequestError(f"the ground is one of {', '.join(get_args(GroundMode))}, got {ground!r}")
-    source = replace(source, stance=source.stance.keep_floor()) if ground == "keep" else source
-    own = source.stance.leveled(motion)
+    if ground == "keep":
+        source = replace(source, stance=source.stance.keep_floor(source.skeleton))
+    own = rotate_foot_frames(motion, -source.stance.tilt)
     scale = leg_length(body.leveled) / leg_length(own.skeleton)
     spans, height = find_ground(own, source.stance)
     higher = 1 - scale if ground == "keep" else 0.0
@@ -356,14 +358,14 @@ def retarget_canonical(
         feet_missed=Miss.of((done.joint_positions()[:, FEET] - ankles).norm(dim=-1), _FOOT_METRES),
         hands_missed=Miss.of(hands_off, _HAND_METRES),
     )
-    return RetargetedMotion(body.stance.restore_foot_tilt(done), changes)
+    return RetargetedMotion(rotate_foot_frames(done, body.stance.tilt), changes)
 
 
 def _carry_fingers(
     clip: Motion, source: RigMap, body: RigMap, pairs: Mapping[int, int]
 ) -> Mapping[int, Float[Tensor, "frames 4"]]:
-    """Return the local rotations (xyzw) of the body's finger joints that turn as the source's do, by joint of its rig;
-    in the T-poses of both rigs, fingers are taken to point along the same direction."""
+    """Return local rotations (xyzw) of the body's fingers that turn as the source's, by joint of its rig; in the
+    T-poses of both, fingers are taken to point along the same direction."""
     ours, theirs = body.rest_quat_xyzw, source.rest_quat_xyzw
     found = {}
     for joint, other in pairs.items():

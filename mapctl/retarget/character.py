@@ -1,6 +1,5 @@
-"""The character that motion is put on, and the lengths of its legs and arms.
-
-How a performer stands: the height of the toe joints over the floor, and the tilt of feet and toes while flat on it.
+"""The character that motion is put on, and how its performer stands: the height of the toe joints over the floor, and
+the tilt of feet and toes while flat on it.
 
 Both belong to the rig as much as bones do, and a T-pose alone does not show them: a table may lay a foot along another
 performer's, and no toe joint is on the floor itself. A clip shows them, where its feet are planted; else the rest pose.
@@ -59,9 +58,6 @@ class Stance:
     """Pitch of foot and toes by side, radians, positive up, against the T-pose while they lie flat."""
     floor: float = 0.0
     """Height of the clip's floor, metres: 0, but where all of it is above or below, as on a platform."""
-    toe_offset: float = 0.0
-    """Height at which toes rest in the clip above that of the bones alone, metres, mean of both; without `floor`, which
-    is not in it."""
 
     @property
     def standing_height(self) -> Float[Tensor, "2"]:
@@ -69,12 +65,12 @@ class Stance:
         over the height of toes that rest."""
         return torch.minimum(self.flat_height, self.toe_height + MAX_TOE_SINK)
 
-    def keep_floor(self) -> "Stance":
+    def keep_floor(self, skeleton: Skeleton) -> "Stance":
         """Return the stance of the same clip in which a floor that seems to be off is off, from 3 cm on: as on a low
-        platform."""
-        off = self.toe_offset if abs(self.toe_offset) > _MIN_FLOOR_OFFSET else 0.0
-        heights = self.toe_height - off, self.flat_height - off
-        return Stance(*heights, self.tilt, self.floor + off, self.toe_offset - off)
+        platform, on which toes rest higher than by the bones alone."""
+        off = float((self.toe_height - Stance.at_rest(skeleton).toe_height).mean())
+        off = off if abs(off) > _MIN_FLOOR_OFFSET else 0.0
+        return Stance(self.toe_height - off, self.flat_height - off, self.tilt, self.floor + off)
 
     @staticmethod
     def at_rest(skeleton: Skeleton) -> "Stance":
@@ -104,21 +100,13 @@ class Stance:
         if float(seen.abs().max()) > _MAX_FLOOR_OFFSET * leg:
             floor = float((seen - rest.toe_height).mean())
             return Stance(rest.toe_height, rest.toe_height + laid - seen, tilt, floor)
-        return Stance(seen, laid, tilt, toe_offset=float((seen - rest.toe_height).mean()))
-
-    def leveled(self, motion: Motion) -> Motion:
-        """Return the same movement with a T-pose whose feet are flat: no joint moves, joint frames of feet rotate."""
-        return _rotate_foot_frames(motion, -self.tilt)
-
-    def restore_foot_tilt(self, motion: Motion) -> Motion:
-        """Undo `leveled`."""
-        return _rotate_foot_frames(motion, self.tilt)
+        return Stance(seen, laid, tilt)
 
 
 def level_feet(clip: Motion) -> Motion:
     """Return the same movement (canonical joints) with joint frames of feet and toes that are aligned with the world
     while the foot is flat on the floor, as the clip shows it (see `Stance.of`); no joint moves."""
-    return _rotate_foot_frames(clip, -_estimate_tilt(clip, _detect_flat_feet(clip)))
+    return rotate_foot_frames(clip, -_estimate_tilt(clip, _detect_flat_feet(clip)))
 
 
 def _rotations_about_x(pitch: Float[Tensor, "2 2"]) -> Float[Tensor, "joints 4"]:
@@ -141,8 +129,11 @@ def _rotate_bones(skeleton: Skeleton, turns: Float[Tensor, "joints 4"]) -> Skele
     return replace(skeleton, offsets=offsets, end_offsets=ends)
 
 
-def _rotate_foot_frames(motion: Motion, pitch: Float[Tensor, "2 2"]) -> Motion:
-    """Change the joint frames of feet and toes: what is in them is rotated, and they are rotated back."""
+def rotate_foot_frames(motion: Motion, pitch: Float[Tensor, "2 2"]) -> Motion:
+    """Return the same movement with joint frames of feet and toes (by side) that are pitched, radians; no joint moves.
+
+    With the negative tilt of its stance, feet are flat in a motion's T-pose; with the tilt itself they are as before.
+    """
     by_joint = _rotations_about_x(pitch)
     world = rotations.multiply(motion.joint_rotations(), rotations.inverse(by_joint).expand_as(motion.local_quat_xyzw))
     local = rotations.make_sign_continuous(kinematics.local_from_world(CANONICAL.parents, world))
@@ -162,8 +153,7 @@ def _detect_flat_feet(clip: Motion) -> Bool[Tensor, "frames 2"]:
 
 
 def _estimate_tilt(clip: Motion, flat: Bool[Tensor, "frames 2"]) -> Float[Tensor, "2 2"]:
-    """Estimate the tilt of foot and toes by side, radians: its median over the frames in which the foot is flat; 0 for
-    a side that has none."""
+    """Estimate the tilt of foot and toes by side, radians: its median over flat frames; 0 for a side without any."""
     forward = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     turns = clip.joint_rotations()[:, [*FEET, *TOES]].reshape(-1, 2, 2, 4)
     up = torch.asin(rotations.rotate(turns, forward.expand(*turns.shape[:3], 3))[..., 1].clamp(-1, 1))
@@ -267,47 +257,36 @@ def make_tpose_clip(rig: Rig) -> Motion:
 
 def _build_skeleton(rig: Rig) -> Skeleton:
     """Build the joints that the rig names, depth first, as files nest them."""
-    names = CANONICAL.names
-    spine, chest = CANONICAL.index("spine"), CANONICAL.index("chest")
-    positions, frames = dict(enumerate(RigPoses.zero(CANONICAL).positions[0])), dict[int, Tensor]()
-    own, above, order = dict[int, str](), dict[int, int](), list[int]()
-
-    def add(joint: int, name: str, parent: int) -> int:
-        own[joint], above[joint] = name, parent
-        order.append(joint)
-        return joint
-
-    def visit(joint: int, parent: int) -> None:
-        if joint == chest and parent == spine and names[chest] in rig.joints:
-            for number, name in enumerate(rig.trunk, start=1):
-                between = add(CANONICAL.num_joints + number, name, parent)
-                positions[between] = torch.lerp(positions[spine], positions[chest], number / (len(rig.trunk) + 1))
-                frames[between], parent = frames[spine], between
-        if names[joint] in rig.joints:
-            axes = rig.tpose.get(names[joint])
-            frames[joint] = frame_from_axes(axes) if axes else unnamed
-            parent = add(joint, rig.joints[names[joint]], parent)
-        for child in CANONICAL.children(joint):
-            visit(child, parent)
-
+    canonical, ends = RigPoses.zero(CANONICAL).positions[0], CANONICAL.end_offsets
     # Joints that no table has are along the file's axes.
     unnamed = torch.eye(3, dtype=torch.float64) if rig.tpose else _file_to_world(rig)
-    visit(0, -1)
-    offsets = [positions[0] if (p := above[j]) < 0 else frames[p].T @ (positions[j] - positions[p]) for j in order]
+    found: list[tuple[str, int, Tensor, Tensor]] = []  # name, parent, position and axes in the world
     tips: dict[str, tuple[float, float, float]] = {}
-    for joint, name in own.items():
-        below = CANONICAL.children(joint) if joint < CANONICAL.num_joints else [chest]
-        if any(names[child] in rig.joints for child in below):
-            continue
-        end = (
-            positions[below[0]] - positions[joint]
-            if below
-            else torch.tensor(CANONICAL.end_offsets[names[joint]]).double()
-        )
-        x, y, z = (frames[joint].T @ end).tolist()
-        tips[name] = (x, y, z)
-    parents = tuple(order.index(above[joint]) if above[joint] >= 0 else -1 for joint in order)
-    return Skeleton(tuple(own[joint] for joint in order), parents, torch.stack(offsets), tips)
+
+    def visit(joint: int, parent: int) -> None:
+        name, children = CANONICAL.names[joint], CANONICAL.children(joint)
+        if name in rig.joints:
+            for number, between in enumerate(rig.trunk if name == "chest" else (), start=1):
+                share, spine = number / (len(rig.trunk) + 1), canonical[CANONICAL.index("spine")]
+                found.append((between, parent, torch.lerp(spine, canonical[joint], share), found[parent][3]))
+                parent = len(found) - 1
+            axes, own = rig.tpose.get(name), rig.joints[name]
+            found.append((own, parent, canonical[joint], frame_from_axes(axes) if axes else unnamed))
+            parent = len(found) - 1
+            if not any(CANONICAL.names[child] in rig.joints for child in children):
+                end = canonical[children[0]] - canonical[joint] if children else torch.tensor(ends[name]).double()
+                x, y, z = (found[parent][3].T @ end).tolist()
+                tips[own] = (x, y, z)
+        for child in children:
+            visit(child, parent)
+
+    visit(0, -1)
+    names, parents, positions, frames = zip(*found, strict=True)
+    offsets = [
+        at if above < 0 else frames[above].T @ (at - positions[above])
+        for above, at in zip(parents, positions, strict=True)
+    ]
+    return Skeleton(names, parents, torch.stack(offsets), tips)
 
 
 def _file_to_world(rig: Rig) -> Float[Tensor, "3 3"]:

@@ -115,8 +115,7 @@ def _check_unit(rigmap: RigMap, motion: Motion) -> Iterator[Doubt]:
 
 
 def _find_other_bodies(rigmap: RigMap, poses: RigPoses) -> Iterator[Doubt]:
-    """Find a second body in the file, a second pair of arms on this one, and joints that do not hang from the joint
-    before in their limb or in the trunk."""
+    """Find a second body, a second pair of arms, and joints that do not hang from the one before in limb or trunk."""
     joints, tree = rigmap.joints, rigmap.rig_skeleton
     other = find_second_body(poses, joints)
     if other is not None:
@@ -134,8 +133,7 @@ def _find_other_bodies(rigmap: RigMap, poses: RigPoses) -> Iterator[Doubt]:
 
 
 def _find_above(rigmap: RigMap, name: str) -> str | None:
-    """Return the joint that a canonical one is to hang from in its limb, or in the trunk over the hips: the first that
-    the rig has; None where there is none."""
+    """Return the first joint of the rig over a canonical one in its limb, or in the trunk over the hips; or None."""
     above = CANONICAL.names[CANONICAL.parents[CANONICAL.index(name)]] if name != "hips" else name
     if above == "hips" or _split(above)[0] != _split(name)[0]:
         return None
@@ -161,8 +159,7 @@ def _compare_sides(rigmap: RigMap, zero: RigPoses, poses: RigPoses) -> Iterator[
 
 
 def _check_names(rigmap: RigMap) -> Iterator[Doubt]:
-    """Check how joints are known: by position alone, beside a joint that was skipped, by other names than their
-    partners, on one side only."""
+    """Check for joints known by position alone, beside a skipped one, by other names than partners, on one side."""
     joints, known, names = rigmap.joints, rigmap.match.known_by, rigmap.rig_skeleton.names
     quoted = {name: _quote(rigmap, joint) for name, joint in joints.items()}
     placed = [name for name, how in known.items() if how is KnownBy.POSITION]
@@ -228,8 +225,7 @@ def _quote(rigmap: RigMap, joint: int) -> str:
 
 
 def _check_bones(body: RigPoses) -> Iterator[Doubt]:
-    """Check the T-pose: lengths of limbs, of both sides, of arms and trunk against legs; what is over and beside
-    what."""
+    """Check lengths of limbs, of both sides, of arms and trunk against legs; and what is over and beside what."""
     length = dict(zip(CANONICAL.names, body.skeleton.offsets.norm(dim=-1).tolist(), strict=True))
     for side, (limb, *parts) in product(SIDES, (("arm", "LowerArm", "Hand"), ("leg", "LowerLeg", "Foot"))):
         joints = (side + parts[0], side + parts[1])

@@ -63,11 +63,9 @@ def mean_by_span(values: Float[Tensor, "frames width"], spans: Spans) -> Float[T
 
 
 def soft_clamp(
-    far: Float[Tensor, "*frames limbs"], most: Float[Tensor, "*#frames limbs"], margin: float
+    far: Float[Tensor, "*frames limbs"], most: Float[Tensor, "*#frames limbs"], soft: Float[Tensor, "*#frames limbs"]
 ) -> Float[Tensor, "*frames limbs"]:
-    """Return how far the end of a limb may be: as far as it is, and ever less beyond what is nearly the most; `margin`
-    is the share of the most over which it gives in."""
-    soft = margin * most
+    """Return how far the end of a limb may be, metres: as far as it is, and ever less from `soft` before the most."""
     over = (far - (most - soft)).clamp_min(0)
     return torch.minimum(far, most - soft) + soft * (1 - torch.exp(-over / soft))
 
@@ -162,8 +160,7 @@ class _Relations(NamedTuple):
         return (influence * weight).sum(dim=-1) / influence.sum(dim=-1).clamp_min(1e-9)
 
     def by_hand(self) -> tuple[Float[Tensor, "frames 2 relations"], Float[Tensor, "frames 2 relations"]]:
-        """Return by hand the weights of its points' relations to segments and floor, and the influence of each among
-        them: the nearest by far the most."""
+        """Return by hand the weights of relations to segments and floor, and influences: the nearest's is greatest."""
         weight = torch.cat([self.weight, self.floor_weight[..., None]], dim=2).unflatten(1, (2, -1)).flatten(2)
         return weight, weight / (1 - weight + _SHARPNESS)
 
@@ -260,8 +257,7 @@ def _hand_points(motion: Motion, size: float) -> Float[Tensor, "frames points 3"
 def _floor_offsets(
     own: Motion, moved: Motion, relations: _Relations, source: Stance, *, scale: float
 ) -> Float[Tensor, "frames points 3"]:
-    """Return offsets that bring points as high over the floor as the source's, metres, and hold over the ground what
-    stands on it."""
+    """Return offsets, metres, that bring points as high over the floor as the source's and hold what stands on it."""
     size = _girth(moved.skeleton)
     points, given = _hand_points(moved, size), scale * _hand_points(own, _girth(own.skeleton))
     offsets = torch.zeros_like(points)
@@ -320,7 +316,7 @@ def _reach(
         most = straight[:, k, None].clamp(_FREE_EXTENSION, _MOST_EXTENSION) * arm.length(moved.skeleton)
         wanted = to_hand + offset[:, k]
         was, far = to_hand.norm(dim=-1, keepdim=True), wanted.norm(dim=-1, keepdim=True)
-        near = torch.minimum(far, torch.maximum(soft_clamp(far, most, _SOFT_MARGIN), was))
+        near = torch.minimum(far, torch.maximum(soft_clamp(far, most, _SOFT_MARGIN * most), was))
         direction = wanted * (near / far.clamp_min(1e-9))
         upper, bent = world[:, arm.upper], moved.local_quat_xyzw[:, arm.lower]
         reached = inverse.reach(arm, upper, bent, direction, moved.skeleton.offsets)

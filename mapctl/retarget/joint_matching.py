@@ -169,8 +169,7 @@ def without_shared_prefix(names: tuple[str, ...]) -> list[str]:
 
 
 def _measure_fit(rig: Rig, found: Mapping[str, int], skeleton: Skeleton, plain: set[str]) -> float:
-    """Measure how well a rig explains a skeleton: the joints it names, and below one joint each what distinguishes
-    relatives."""
+    """Measure how well a rig explains a skeleton: joints it names, and below one joint what distinguishes relatives."""
     extra = {normalise_name(name) for name in (*rig.also, *rig.trunk)}
     explained = len(found) + len(extra & plain - {normalise_name(skeleton.names[j]) for j in found.values()})
     lacking = len(rig.joints) - len(found) + len(extra - plain)

@@ -39,10 +39,9 @@ _LEG_TOLERANCE = math.radians(35)  # between the legs of a standing rest pose an
 _EXACT_TPOSE_ANGLE = math.radians(15)  # of arms and legs in a frame that is a T-pose on purpose
 UNROTATED = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
 _END_SITES = ("Toes", "Hand", "head")  # joints whose position an End Site of the joint above may give
-_VECTORS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class TPose:
     """The pose of the rig that corresponds to the canonical skeleton's rest pose."""
 
@@ -96,16 +95,7 @@ def find_tpose(
     faces = "unknown" if rest == "neither" else nearest_axis_name(front[2])
 
     def choose(quats: Tensor, idle: Tensor, source: str, doubt: str = "") -> TPose:
-        return TPose(
-            tpose_quat_xyzw=quats,
-            idle_quat_xyzw=idle,
-            upright_quat_xyzw=upright,
-            up=up,
-            facing=faces,
-            rest=rest,
-            tpose_from=source,
-            tpose_doubt=doubt,
-        )
+        return TPose(quats, idle, upright, up, faces, rest, source, doubt)
 
     # Readings: rotations of canonical joints, idle rotations of the rig's, and where they come from.
     readings: list[tuple[Tensor, Tensor, str]] = []
@@ -196,7 +186,7 @@ def _is_exact_tpose(poses: RigPoses, front: Float[Tensor, "3 3"]) -> bool:
 
 def axis_vector(axis: str) -> Float[Tensor, "3"]:
     """Return the vector of an axis by name, as `-z`."""
-    return torch.tensor(_VECTORS[axis[-1]], dtype=torch.float64) * (-1 if axis.startswith("-") else 1)
+    return torch.eye(3, dtype=torch.float64)["xyz".index(axis[-1])] * (-1 if axis.startswith("-") else 1)
 
 
 def nearest_axis_name(direction: Float[Tensor, "3"]) -> str:

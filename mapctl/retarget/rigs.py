@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field
@@ -23,8 +23,27 @@ UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 """Names of length units that a rig's TOML may use, in metres."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class _RigSettings:
+    """What a rig and its file have alike."""
+
+    about: str = ""
+    """Description of the rig, one line."""
+    also: tuple[str, ...] = ()
+    """Further joints of the rig, that distinguish it from its relatives."""
+    trunk: tuple[str, ...] = ()
+    """Joints between spine and chest, upwards."""
+    up: str = "auto"
+    """Axis of the file's world that points up: one of AXES; `auto` to find it."""
+    facing: str = "auto"
+    """Axis of the file that the rest pose faces: one of AXES; `auto` to find it."""
+    rest: str = "auto"
+    """Where the T-pose comes from: `tpose` (all rotations zero is one, as it is), `straighten` (all zero, with the
+    limbs straightened), `frame0` (the clip begins with one), or `auto` (the table of the T-pose, else what fits)."""
+
+
 @dataclass(frozen=True)
-class Rig:
+class Rig(_RigSettings):
     """Names, T-pose and axes of a rig, as known before any file of it is read."""
 
     name: str
@@ -37,25 +56,10 @@ class Rig:
     idle: Mapping[str, list[float]] = field(default_factory=dict)
     """Local rotation (xyzw) in the T-pose by the rig's own joint; joints that are canonical ones or left out have
     none."""
-    end_sites: tuple[str, ...] = ()
-    """Canonical joints that the rig has only as the End Site of their canonical parent."""
-    about: str = ""
-    """Description of the rig, one line."""
     aliases: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Canonical joint name to the other names that versions of the rig use, one entry a version."""
-    also: tuple[str, ...] = ()
-    """Further joints of the rig, that distinguish it from its relatives."""
-    up: str = "auto"
-    """Axis of the file's world that points up: one of AXES; `auto` to find it."""
-    facing: str = "auto"
-    """Axis of the file that the rest pose faces: one of AXES; `auto` to find it."""
-    rest: str = "auto"
-    """Where the T-pose comes from: `tpose` (all rotations zero is one, as it is), `straighten` (all zero, with the
-    limbs straightened), `frame0` (the clip begins with one), or `auto` (the table above, else what fits)."""
     metres_per_unit: float | None = None
     """Length of the file's unit, metres; None to find it by the size of the body."""
-    trunk: tuple[str, ...] = ()
-    """Joints between spine and chest, upwards."""
 
     def __post_init__(self):
         for key, value, allowed in (("up", self.up, AXES), ("facing", self.facing, AXES), ("rest", self.rest, RESTS)):
@@ -122,21 +126,14 @@ class _Axes:
 
 
 @dataclass(frozen=True)
-class _RigFile:
-    """Contents of a rig file: fields of `Rig`; a joint may have several names, one a version of the rig."""
+class _RigFile(_RigSettings):
+    """Contents of a rig file; a joint may have several names, one a version of the rig."""
 
     __pydantic_config__ = toml.STRICT
 
     name: str = ""
-    about: str = ""
-    also: tuple[str, ...] = ()
-    trunk: tuple[str, ...] = ()
     joints: Mapping[str, str | Annotated[tuple[str, ...], Field(min_length=1)]] = field(default_factory=dict)
     tpose: Mapping[str, _Axes] = field(default_factory=dict)
-    end_sites: tuple[str, ...] = ()
-    up: str = "auto"
-    facing: str = "auto"
-    rest: str = "auto"
     unit: float | str = "auto"
 
     def build(self, name: str) -> Rig:
@@ -148,17 +145,17 @@ class _RigFile:
             aliases={joint: own[1:] for joint, own in names.items() if len(own) > 1},
             tpose={joint: {"x": [*axes.x], "y": [*axes.y]} for joint, axes in self.tpose.items()},
             metres_per_unit=parse_unit(self.unit),
-            **{key: getattr(self, key) for key in ("about", "also", "trunk", "end_sites", "up", "facing", "rest")},
+            **{item.name: getattr(self, item.name) for item in fields(_RigSettings)},
         )
 
 
-def parse_unit(unit: Any) -> float | None:
+def parse_unit(unit: str | float | None) -> float | None:
     """Parse the name of a unit, or metres per unit; None for `auto` and None; RequestError for anything else."""
     if unit in (None, "auto"):
         return None
     try:
-        metres = UNITS[unit] if unit in UNITS else math.nan if isinstance(unit, bool) else float(unit)
-    except (TypeError, ValueError):  # a list or a table, a word
+        metres = UNITS.get(str(unit)) or float(unit)
+    except ValueError:
         metres = math.nan
     if not 1e-6 < metres < 1e6:
         raise RequestError(f"a unit is {', '.join(UNITS)} or metres per unit, got {unit!r}")

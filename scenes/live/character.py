@@ -98,7 +98,7 @@ class SkinnedBody:
 
     def prepare(self, motion: Motion) -> list[Pose]:
         """Prepare the poses of frames on canonical joints with the character's bones: transforms of its bones."""
-        placed = self._character.put_on(motion).placed.motion
+        placed = self._character.put_on(motion).motion
         positions, quats = placed.joint_positions().numpy(), placed.joint_rotations().numpy()
         return list(zip(positions[:, self._joints], quats[:, self._joints], strict=True))
 

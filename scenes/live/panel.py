@@ -174,9 +174,9 @@ class Panel:
             self.back.value = back
 
     def _on_change(self, handle: Any, action: Callable[[Any], Any]) -> None:
-        """Act when a user moves a control, on its value then; not when the server moves it. Coroutines run in the order
-        in which browsers did things."""
+        """Act when a user moves a control, on its value then; not when the server moves it."""
 
+        # Coroutines run in the order in which browsers did things.
         @handle.on_update
         async def _(event: viser.GuiEvent) -> None:
             value = handle.value

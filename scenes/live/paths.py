@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
+import torch
 import trimesh
 import viser
 
@@ -49,11 +50,8 @@ def make_curve(points: Sequence[Point], *, closed: bool) -> Curve:
 
 def sample_curve(curve: Curve, spacing: float = _SPACING, most: int = _MAX_SAMPLES) -> Array:
     """Sample a curve (n, 2) at equal distances of about `spacing` metres; a closed one ends where it begins."""
-    vertices = curve.points.numpy()
-    lengths = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(vertices, axis=0), axis=1))]
-    arcs = np.linspace(0, curve.length, min(most, max(2, math.ceil(curve.length / spacing) + 1)))
-    samples = np.stack([np.interp(arcs, lengths, axis) for axis in vertices[:, [0, -1]].T], axis=1)
-    return np.concatenate([samples[:-1], samples[:1]]) if curve.closed else samples
+    count = min(most, max(2, math.ceil(curve.length / spacing) + 1))
+    return curve.ground_point(torch.linspace(0, curve.length, count, dtype=torch.float64)).numpy()
 
 
 def write_csv(curve: Curve) -> bytes:

@@ -79,7 +79,7 @@ def join_chunks(character: ShownCharacter, chunks: Sequence[FrameChunk]) -> Moti
     if look.on_rig is not None:
         motion = look.on_rig(motion)
     elif look.drawn is not None:
-        motion = look.drawn.put_on(motion).placed.motion
+        motion = look.drawn.put_on(motion).motion
     return replace(motion, licence=look.licence)
 
 

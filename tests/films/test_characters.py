@@ -72,7 +72,7 @@ def test_a_character_in_its_own_motion_is_where_its_file_has_it(result, name):
     motion = formats.load(path)
     drawn = DrawnCharacter.load(path).put_on(motion)
     assert drawn.notes == ()
-    assert drawn.placed.motion is motion, "nothing is converted"
+    assert drawn.motion is motion, "nothing is converted"
     body = drawn.build_body(motion.fps, GREY)
     for frame in (0, 7, 19, 30):
         wanted = viewer.skinned(0, frame / 30)
@@ -85,14 +85,14 @@ def test_any_motion_is_put_on_it_as_convert_does(result, name, tmp_path):
     path, clip = result[name].path, long_walk(45)
     drawn = DrawnCharacter.load(path).put_on(clip)
     written = tmp_path / f"walk{path.suffix}"
-    drawn.placed.motion.save(written)
+    drawn.motion.save(written)
     viewer, body = GlbViewer(written), drawn.build_body(clip.fps, GREY)
     for frame in (0, 20, 44):
         wanted = viewer.skinned(0, frame / 30)
         np.testing.assert_allclose(vertices_of(body, frame), wanted, atol=1e-5)
     own = RiggedCharacter.of(DrawnCharacter.load(path).standing)[1]
     expected = own.on_rig(retarget_motion(clip, own).motion)
-    np.testing.assert_allclose(drawn.placed.motion.joint_positions(), expected.joint_positions(), atol=1e-9)
+    np.testing.assert_allclose(drawn.motion.joint_positions(), expected.joint_positions(), atol=1e-9)
 
 
 @pytest.mark.slow
@@ -112,10 +112,10 @@ def test_a_motion_with_the_characters_bones_keeps_them_as_they_are(hero):
     solved = random_motion(hero.body.leveled, 6, seed=3)
     drawn = hero.put_on(solved)
     joints = hero.body.leveled_map.joints
-    placed, wanted = drawn.placed.motion.joint_positions(), solved.joint_positions()
+    placed, wanted = drawn.motion.joint_positions(), solved.joint_positions()
     for name in ("hips", "leftLowerArm", "rightHand", "leftLowerLeg", "rightFoot"):
         np.testing.assert_allclose(placed[:, joints[name]], wanted[:, CANONICAL.index(name)], atol=1e-6)
-    assert drawn.placed.bones is solved
+    assert drawn.bones is solved
 
 
 def test_what_is_no_character_is_refused(tmp_path):

@@ -91,7 +91,7 @@ def test_the_browser_draws_the_mesh_where_films_do(hero):
     assert len(poses) == 30
     for frame in (0, 14, 29):
         body.pose(poses[frame])
-        placed = hero.put_on(motion).placed.motion
+        placed = hero.put_on(motion).motion
         turns = rotations.to_matrix(placed.joint_rotations()[frame]).numpy()
         vertices, _ = hero.mesh.pose(placed.joint_positions()[frame].numpy(), turns)
         wanted = np.sort(vertices[hero.mesh.faces].mean(axis=1).round(4), axis=0)
@@ -113,7 +113,7 @@ def test_a_recording_is_of_the_character(hero, ending, tmp_path):
     path.write_bytes(encode_motion(motion, ending))
     if ending == "glb":
         own = on_its_bones(hero, 90).slice(0, 12)
-        placed = hero.put_on(own).placed.motion
+        placed = hero.put_on(own).motion
         turns = rotations.to_matrix(placed.joint_rotations()[5]).numpy()
         vertices, _ = hero.mesh.pose(placed.joint_positions()[5].numpy(), turns)
         skinned = GlbViewer(path).skinned(0, 5 / 30)
