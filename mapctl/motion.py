@@ -8,7 +8,7 @@ from importlib import import_module
 from os import PathLike
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from mapctl import kinematics, rotations
@@ -106,6 +106,10 @@ class Motion:
         if not 0 <= start < stop <= self.num_frames:
             raise RequestError(f"frames {start}:{stop} are not within 0:{self.num_frames}")
         return self._map_frames(lambda values: values[start:stop])
+
+    def pick(self, frames: Int[Tensor, " picked"]) -> "Motion":
+        """Return some frames, in that order; a frame may be named more than once."""
+        return self._map_frames(lambda values: values[frames])
 
     def reverse(self) -> "Motion":
         """Return the motion backward in time."""

@@ -236,6 +236,13 @@ def _handedness(first: Int[Tensor, "*batch"], second: Int[Tensor, "*batch"]) -> 
     return torch.where((second - first) % 3 == 1, 1, -1)
 
 
+def turns_between(
+    start_xyzw: Float[Tensor, "*#batch 4"], stop_xyzw: Float[Tensor, "*#batch 4"]
+) -> Float[Tensor, "*batch 3"]:
+    """Return the shortest rotation vectors from rotations to others, in the frames of the first."""
+    return to_rotation_vector(multiply(inverse(start_xyzw), stop_xyzw))
+
+
 def make_sign_continuous(quat_xyzw: Float[Tensor, "frames *joints 4"]) -> Float[Tensor, "frames *joints 4"]:
     """Choose signs of the same rotations so that neighbouring frames lie in one half of the sphere."""
     dots = (quat_xyzw[1:] * quat_xyzw[:-1]).sum(-1)
@@ -260,5 +267,5 @@ def slerp(
 ) -> Float[Tensor, "*batch 4"]:
     """Interpolate spherically along the shortest arc; weight 0 gives the start."""
     aligned = torch.where((start_xyzw * stop_xyzw).sum(-1, keepdim=True) < 0, -stop_xyzw, stop_xyzw)
-    step = to_rotation_vector(multiply(inverse(start_xyzw), aligned))
+    step = turns_between(start_xyzw, aligned)
     return multiply(start_xyzw, from_rotation_vector(step * weight.unsqueeze(-1)))

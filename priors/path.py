@@ -156,8 +156,7 @@ class PathNetwork(nn.Module):
         scaled = ((motion.positions[..., 1:, :] - self.mean) / self.std).flatten(-2)
         steps = motion.anchored_steps()[..., 1:, :].flatten(-2) / _VELOCITY_UNIT
         turns = motion.turns[..., None] / _TURN_UNIT
-        present = motion.present[..., None].to(scaled)
-        return torch.cat([scaled, steps, turns, torch.ones_like(turns)], dim=-1) * present
+        return torch.cat([scaled, steps, turns, torch.ones_like(turns)], dim=-1)
 
 
 def _mix_anchored_steps(motion: LocalMotion, shares: Float[Tensor, "batch frames shares"]) -> Tensor:

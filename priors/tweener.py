@@ -163,7 +163,6 @@ def make_key_image(motion: PartialMotion, given: GivenParts) -> PositionImage:
         see_contacts(motion.contacts, given.known),
         known=given.axes.all(dim=-1),
         present=torch.ones_like(given.heading),
-        toes=TOE_JOINTS,
         known_axes=given.axes,
     )
 
@@ -773,7 +772,6 @@ def _show(query: GapQuery, given: Mapping[int, Float[Tensor, "joints 3"]]) -> tu
         see_contacts(planted[None], known.any(dim=1)[None]),
         known=known[None],
         present=torch.ones(1, len(positions), dtype=torch.bool),
-        toes=TOE_JOINTS,
     )
     return (image if query.loose is None else show_loose_keys(image, query.loose)), origin
 

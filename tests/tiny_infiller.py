@@ -11,7 +11,6 @@ from priors import checkpoints
 from priors.infiller import ConvInfiller, InfillerConfig, InfillerNetwork
 
 CONFIG = InfillerConfig(widths=(8, 8, 8, 8, 8))
-TOES = (CANONICAL.index("leftToes"), CANONICAL.index("rightToes"))
 _SPREAD = 0.1  # metres: what one unit of a place is
 
 
@@ -55,6 +54,5 @@ def shown(motion, known=None, *, present=None, contacts=None):
         kinematics.heading(motion.local_quat_xyzw[:, 0])[None],
         torch.ones(1, frames, 2).double() if contacts is None else contacts,
         known=whole if known is None else known,
-        toes=TOES,
         present=whole[..., 0] if present is None else present,
     )

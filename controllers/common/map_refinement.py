@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.contacts import compute_rest_log_probability, debounced, fit_supports
-from mapctl.features import LAYOUT, GroundPose
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose
 from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
@@ -29,7 +29,8 @@ from mapctl.problem.solution import Ledger, Outcome, WindowRecord
 from mapctl.problem.window_solvers import PoseOffsetSolver
 from mapctl.protocols import Density
 from mapctl.recording import Capture
-from mapctl.skeleton import CANONICAL, TOES
+from mapctl.recording.masks import MissingMask
+from mapctl.skeleton import TOE_JOINTS, TOES
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.terms import Clearance, FootContact, Jerk, Keyframe, LatentPrior, Term
@@ -90,14 +91,16 @@ class RefinedMotion:
     windows: tuple[WindowRecord, ...]
     """Cost of each window."""
 
-    @property
-    def density_intervals(self) -> tuple[DensityInterval, ...]:
-        """Density and its weight in each window, in frames at PRIOR_FPS; empty where none was given."""
-        stops = list(accumulate(window.frames for window in self.windows))
+    def density_intervals(self, motion: Motion) -> tuple[DensityInterval, ...]:
+        """Return density and its weight in each window, in frames of a motion of this one's duration at any rate; none
+        where no density was given."""
+        ends = accumulate(window.frames for window in self.windows)
+        stops = [min(motion.num_frames, round(end * float(motion.fps) / PRIOR_FPS)) for end in ends]
+        stops[-1] = motion.num_frames
         return tuple(
-            DensityInterval(stop - window.frames, stop, choice.density.name, choice.nats, choice.weight)
-            for stop, window in zip(stops, self.windows, strict=True)
-            if (choice := window.choice) is not None
+            DensityInterval(start, stop, choice.density.name, choice.nats, choice.weight)
+            for start, stop, window in zip([0, *stops], stops, self.windows, strict=False)
+            if (choice := window.choice) is not None and start < stop
         )
 
 
@@ -125,7 +128,8 @@ def refine(
     start = _extrapolate_backward(pose)
     root, angle = _compute_proposal_sigma(capture, settings, trust)
     planted, supports = _find_contacts(proposal, contacts, root, angle, settings.smooth)
-    clearing = _ramp_from_observed(_find_observed_toes(capture), settings.clearance_ramp)
+    observed = MissingMask(~capture.seen[0], ~capture.seen_root[0]).known_positions[:, TOE_JOINTS]
+    clearing = _ramp_from_observed(observed, settings.clearance_ramp)
 
     def terms_of(first: int, frames: int) -> list[Term]:
         part = slice(first, first + frames)
@@ -235,17 +239,6 @@ def _compute_proposal_sigma(
     root = torch.where(capture.seen_root[0], settings.share * capture.sigma_root[0], unobserved_root)
     # Feet are planted even in a capture without noise, if only by half a millimetre.
     return root.clamp_min(5e-4)[:, None], angle
-
-
-def _find_observed_toes(capture: Capture) -> Bool[Tensor, "frames 2"]:
-    """Return whether the toes' positions were observed: the hips', and the rotations of all joints above the toes."""
-    observed = capture.seen_root[0][:, None].repeat(1, len(TOES))
-    for foot, name in enumerate(TOES):
-        joint = CANONICAL.parents[CANONICAL.index(name)]
-        while joint >= 0:
-            observed[:, foot] &= capture.seen[0, :, joint]
-            joint = CANONICAL.parents[joint]
-    return observed
 
 
 def _ramp_from_observed(observed: Bool[Tensor, "frames columns"], ramp: float) -> Float[Tensor, "frames columns"]:

@@ -7,7 +7,7 @@ previous pass's preview of them, so that the seam between two passes is continuo
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from controllers.denoising.denoise import MIN_DENOISE_FRAMES, DenoiseSettings, denoise
 from controllers.denoising.solution import DenoiseSolution, crossfade, join_segments
@@ -15,36 +15,12 @@ from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
 from mapctl.protocols import Denoiser
-from mapctl.recording.masks import Mask, slice_masks, trim_masks_before, write_back_masked
+from mapctl.recording.masks import Mask, slice_masks, write_back_masked
 from mapctl.retarget.rigs import Rig
 
 _MAX_DELAY = 5.0
+_STEP_SECONDS = 0.1  # between passes
 _RIG_SECONDS = 1.0  # seconds from which the rig is identified
-
-
-@dataclass(frozen=True)
-class CausalSettings:
-    """Delay, step and history of the passes over a stream."""
-
-    delay: float = 0.2
-    """Longest wait of a frame until it is decided, seconds."""
-    step: float = 0.1
-    """Time between passes, seconds, at most half of the delay: a pass sees at least the rest of the delay beyond the
-    frames that it decides."""
-    past: float = 2.5
-    """History that a pass sees, seconds."""
-
-    def __post_init__(self):
-        if not 1 / PRIOR_FPS <= self.delay <= _MAX_DELAY:
-            raise RequestError(f"the delay must be {1 / PRIOR_FPS:.2f} to {_MAX_DELAY:g} s, got {self.delay:g}")
-
-    def compute_delay_frames(self, fps: float) -> tuple[int, int]:
-        """Compute the longest wait of a frame, in frames, and how many fewer the last frame that a pass decides waits.
-
-        Whole frames within the delay: at 24 frames/s and 0.2 s four, which take 0.17 s.
-        """
-        most = math.floor(self.delay * fps + 1e-9)
-        return most, max(1, round(min(self.step, self.delay / 2) * fps))
 
 
 class CausalDenoiser:
@@ -55,29 +31,35 @@ class CausalDenoiser:
         denoiser: Denoiser,
         *,
         settings: DenoiseSettings | None = None,
-        causal: CausalSettings | None = None,
+        delay: float = 0.2,
+        past: float = 2.5,
         rig: Rig | None = None,
     ):
-        """Begin without frames; `rig` overrides recognition."""
+        """Begin without frames. A frame waits for at most `delay` seconds until it is decided, by passes that see
+        `past` seconds before; `rig` overrides recognition."""
+        if not 1 / PRIOR_FPS <= delay <= _MAX_DELAY:
+            raise RequestError(f"the delay must be {1 / PRIOR_FPS:.2f} to {_MAX_DELAY:g} s, got {delay:g}")
         self._denoiser, self._settings, self._rig = denoiser, settings or DenoiseSettings(), rig
         self._rig_identified = False  # from the capture's beginning, which later passes do not see
-        self._causal = causal or CausalSettings()
+        self.delay, self._history = delay, past
         self._past: Motion | None = None  # frames that a pass sees
         self._first = 0  # frame of the capture that they begin with
         self._delivered = 0  # number of frames returned so far
         self._previous: tuple[Motion, int] | None = None  # result of the previous pass, and its first frame
         self._masks: tuple[Mask, ...] = ()
 
-    @property
-    def delay(self) -> float:
-        """Longest time between a frame and its clean one, seconds, without the compute; at any frame rate."""
-        return self._causal.delay
+    def compute_delay_frames(self, fps: float) -> tuple[int, int]:
+        """Compute the longest wait of a frame, in frames, and how many fewer the last frame that a pass decides waits:
+        at most half, so that a pass sees the rest beyond the frames that it decides.
+
+        Whole frames within the delay: at 24 frames/s and 0.2 s four, which take 0.17 s.
+        """
+        return math.floor(self.delay * fps + 1e-9), max(1, round(min(_STEP_SECONDS, self.delay / 2) * fps))
 
     def push(self, frames: Motion, *, masks: Sequence[Mask] = ()) -> DenoiseSolution | None:
         """Take the next frames of the capture and return those that are due, None if none are. Masks count from the
-        first frame of the capture.
-        """
-        most, step = self._causal.compute_delay_frames(float(frames.fps))
+        first frame of the capture."""
+        most, step = self.compute_delay_frames(float(frames.fps))
         self._masks = (*self._masks, *masks)
         self._past = frames if self._past is None else self._past.join(frames)
         received = self._first + self._past.num_frames
@@ -93,15 +75,17 @@ class CausalDenoiser:
     def _denoise_recent(self, due: int) -> DenoiseSolution:
         assert self._past is not None
         # Results for missing joints are written into the past: later passes see nothing else of them.
-        masks = slice_masks(
-            trim_masks_before(self._masks, self._delivered), self._first, self._first + self._past.num_frames
-        )
+        end = self._first + self._past.num_frames
+        masks = slice_masks(self._masks, self._first, end, since=self._delivered)
         done = denoise(self._past, self._denoiser, masks=masks, settings=self._settings, rig=self._rig)
         if not self._rig_identified and self._past.seconds >= _RIG_SECONDS:
             self._rig, self._rig_identified = done.rig, True
         start, count = self._delivered - self._first, due - self._delivered
         result = done.slice(start, start + count)
-        result = replace(result, status=replace(result.status, notes=self._notes(done, due)))
+        notes = done.notes if self._delivered == 0 else ()
+        if self._past.num_frames < MIN_DENOISE_FRAMES:
+            notes = (f"frames {self._delivered}:{due} were due before noise could be estimated: they were not changed",)
+        result = replace(result, status=replace(result.status, notes=notes))
         if self._previous is not None:
             past, first = self._previous
             shared = min(count, first + past.num_frames - self._delivered)
@@ -113,24 +97,11 @@ class CausalDenoiser:
         renewed = write_back_masked(past, result.motion, part_masks)
         self._past = self._past.slice(0, start).join(renewed) if start else renewed
         self._previous, self._delivered = (done.motion, self._first), due
-        self._discard_past()
-        return result
-
-    def _notes(self, done: DenoiseSolution, due: int) -> tuple[str, ...]:
-        """Return the notes of a pass, only the first one's, and a note on frames that were due too early."""
-        assert self._past is not None
-        if self._past.num_frames < MIN_DENOISE_FRAMES:
-            few = f"frames {self._delivered}:{due} were due before noise could be estimated: they were not changed"
-            return (few,)
-        return done.notes if self._delivered == 0 else ()
-
-    def _discard_past(self) -> None:
-        """Discard frames before the history that a pass sees."""
-        assert self._past is not None
-        kept = max(1, round((self._causal.past + self._causal.delay) * float(self._past.fps)))
+        kept = max(1, round((self._history + self.delay) * float(self._past.fps)))
         dropped = min(self._past.num_frames - kept, self._delivered - self._first)
-        if dropped > 0:
+        if dropped > 0:  # frames before the history that a pass sees
             self._past, self._first = self._past.slice(dropped, self._past.num_frames), self._first + dropped
+        return result
 
 
 def denoise_causal(
@@ -139,13 +110,13 @@ def denoise_causal(
     *,
     masks: Sequence[Mask] = (),
     settings: DenoiseSettings | None = None,
-    delay: float = CausalSettings.delay,
+    delay: float = 0.2,
     rig: Rig | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> DenoiseSolution:
     """A whole motion through a CausalDenoiser, a frame at a time."""
     began = time.perf_counter()
-    stream = CausalDenoiser(denoiser, settings=settings, causal=CausalSettings(delay=delay), rig=rig)
+    stream = CausalDenoiser(denoiser, settings=settings, delay=delay, rig=rig)
     pieces: list[tuple[DenoiseSolution, int]] = []
     delivered = 0
     for frame in range(motion.num_frames):

@@ -26,7 +26,6 @@ from mapctl.contacts import debounced
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery
-from mapctl.inbetweening.missing import MissingMask
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
 from mapctl.pose import BodyPose
@@ -54,10 +53,11 @@ from mapctl.recording.inspection import (
 )
 from mapctl.recording.masks import (
     Mask,
+    MissingMask,
     expand_valid_masks,
     resolve_joint_names,
+    restore_observed,
     slice_masks,
-    trim_masks_before,
     write_back_masked,
 )
 from mapctl.recording.noise_estimation import choose_continuous_signs, estimate_angle_noise, estimate_position_noise
@@ -121,7 +121,7 @@ def denoise(
         motion, stretched = hold_rigid_bones(capture)
     denoiser = denoiser if inbetweener is None else LostPartFiller(denoiser, inbetweener)
     masks = resolve_joint_names(motion, masks, rig)
-    hidden, _ = expand_valid_masks(motion, masks)  # checked whole: for a segment they are cut to its frames
+    hidden = expand_valid_masks(motion, masks).joints  # checked whole: for a segment they are cut to its frames
     # Identified once: a segment may lack the frames that show the rig's T-pose.
     beginning, rigmap = to_canonical(motion.slice(0, min(motion.num_frames, _RIG_FRAMES)), rig)
     motion, swapped = exchange_swapped_limbs(motion, rigmap, hidden)
@@ -137,7 +137,7 @@ def denoise(
         if pieces:  # missing joints are known only from the segment before
             last, first = pieces[-1]
             part = write_back_masked(part, last.motion.slice(start - first, before - first), part_masks)
-            part_masks = trim_masks_before(part_masks, before - start)
+            part_masks = slice_masks(masks, lead + start, lead + stop, since=lead + before)
         first_frame = round((lead + start) / fps * PRIOR_FPS)
         done = _denoise_segment(part, denoiser, part_masks, settings, densities, terms, rig, first_frame)
         pieces.append((done, start))
@@ -160,49 +160,34 @@ def denoise(
 def _prepend_lead(
     lead: Motion, done: DenoiseSolution, shares: Float[Tensor, " lead"], rigmap: RigMap
 ) -> DenoiseSolution:
-    """Put the lead pose before a clean motion; what is known by frame is there as in the first one after it.
-
-    Frame 0 is shrunk towards the rest pose, and frames blended with it towards the arc from there to the motion, as far
-    as the noise explains what lies between.
-    """
+    """Put the lead pose before a clean motion; what is known by frame is there as in the first one after it. Frame 0 is
+    shrunk towards the rest pose, and frames blended with it towards the arc from there to the motion, as far as the
+    noise explains what lies between."""
     frames, count = lead.num_frames, round(lead.num_frames * PRIOR_FPS / float(lead.fps))
     captured, tpose = lead.local_quat_xyzw, torch.zeros(1, CANONICAL.num_joints, 4, dtype=torch.float64)
     tpose[..., 3] = 1
     at_rest = from_canonical(Motion(rigmap.skeleton, lead.fps, lead.root_position[:1], tpose), rigmap).local_quat_xyzw
     zero = torch.zeros_like(at_rest).index_fill(-1, torch.tensor(3), 1.0)
-    rest = min((zero, at_rest), key=lambda quats: float(_find_turns(quats, captured[:1]).norm(dim=-1).mean()))
-    first = _shrink(rest, captured[:1], done.noise)
-    whole = _find_turns(first, done.motion.local_quat_xyzw[:1])
-    arc = rotations.multiply(
-        first.expand_as(captured[1:]), rotations.from_rotation_vector(shares[1:, None, None].to(whole) * whole)
-    )
+    apart = [float(rotations.turns_between(quats, captured[:1]).norm(dim=-1).mean()) for quats in (zero, at_rest)]
+    first = _shrink(zero if apart[0] <= apart[1] else at_rest, captured[:1], done.noise)
+    whole = rotations.turns_between(first, done.motion.local_quat_xyzw[:1])
+    arc = rotations.multiply(first, rotations.from_rotation_vector(shares[1:, None, None].to(whole) * whole))
     clean = torch.cat([first, _shrink(arc, captured[1:], done.noise)])
-    lead = replace(lead, local_quat_xyzw=clean)
-    contacts, share, error = (
-        torch.cat([values[:1].expand(count, -1), values]) for values in (done.contacts, done.proposal_share, done.error)
-    )
     return replace(
         done,
-        motion=lead.join(done.motion),
+        motion=replace(lead, local_quat_xyzw=clean).join(done.motion),
         faults=move_frames(done.faults, frames),
         density_intervals=move_frames(done.density_intervals, frames),
-        contacts=contacts,
-        proposal_share=share,
-        error=error,
+        **{name: torch.cat([values[:1].expand(count, -1), values]) for name, values in done.by_frame.items()},
     )
-
-
-def _find_turns(start: Tensor, stop: Tensor) -> Float[Tensor, "frames joints 3"]:
-    """Return rotation vectors from rotations to others, radians."""
-    return rotations.to_rotation_vector(rotations.multiply(rotations.inverse(start).expand_as(stop), stop))
 
 
 def _shrink(expected: Tensor, captured: Tensor, noise: Float[Tensor, " joints"]) -> Float[Tensor, "frames joints 4"]:
     """Shrink captured rotations towards expected ones by the share of their squared distance that is noise."""
-    turns = _find_turns(expected, captured)
+    turns = rotations.turns_between(expected, captured)
     power = turns.square().sum(dim=-1, keepdim=True).clamp_min(1e-12)
     kept = (1 - (_LEAD_SIGMAS * noise[:, None]).square() / power).clamp_min(0)
-    return rotations.multiply(expected.expand_as(captured), rotations.from_rotation_vector(kept * turns))
+    return rotations.multiply(expected, rotations.from_rotation_vector(kept * turns))
 
 
 def _denoise_segment(
@@ -257,15 +242,6 @@ def _denoise_segment(
     if whole and _measure_roughness(clean) > _measure_roughness(motion):
         start = first_frame / PRIOR_FPS
         notes = (f"frames from {start:.1f} s on would become rougher than they are: they were not changed",)
-    stops = [part.stop for part in refined.density_intervals]
-    densities_used = [
-        replace(
-            part,
-            start=round(part.start * fps / PRIOR_FPS),
-            stop=last + 1 if stop == shown.num_frames else round(stop * fps / PRIOR_FPS),
-        )
-        for part, stop in zip(refined.density_intervals, stops, strict=True)
-    ]
     return DenoiseSolution(
         motion if notes else clean,
         Status(Outcome.DONE, notes),
@@ -279,7 +255,7 @@ def _denoise_segment(
         contacts=refined.contacts,
         proposal_share=share[at],
         error=error[at],
-        density_intervals=move_frames(densities_used, 0, stop=last + 1),
+        density_intervals=refined.density_intervals(motion),
     )
 
 
@@ -370,11 +346,9 @@ def _propose(
     observation: _Observation, denoiser: Denoiser
 ) -> tuple[Motion, Float[Tensor, "frames 2"], Float[Tensor, "frames joints"]]:
     """Propose the motion on the performer's bones, contact logits, and the expected error of each of a joint's angles,
-    radians, at the capture's rate.
-
-    The denoiser sees every nth frame of the capture without what is too fast for that, or at low rates its frames with
-    unobserved ones between them, so that no noise is interpolated: whole steps that come nearest to PRIOR_FPS.
-    """
+    radians, at the capture's rate. The denoiser sees every nth frame of the capture without what is too fast for that,
+    or at low rates its frames with unobserved ones between them, so that no noise is interpolated: whole steps that
+    come nearest to PRIOR_FPS."""
     canonical, skeleton, fps = observation.canonical, observation.rigmap.skeleton, float(observation.canonical.fps)
     scale = leg_length(CANONICAL) / leg_length(skeleton)
     step, between = max(1, round(fps / PRIOR_FPS)), max(1, round(PRIOR_FPS / fps))
@@ -430,8 +404,8 @@ def _list_faults(
 ) -> tuple[Artefact, ...]:
     """List the artefacts, on the rig; `shown` is the motion before the MAP stage."""
     capture, names, frames = inspection.motion, clean.skeleton.names, clean.num_frames
-    turn = rotations.multiply(rotations.inverse(capture.local_quat_xyzw), clean.local_quat_xyzw)
-    turned = torch.rad2deg(rotations.to_rotation_vector(turn).norm(dim=-1))
+    turns = rotations.turns_between(capture.local_quat_xyzw, clean.local_quat_xyzw)
+    turned = torch.rad2deg(turns.norm(dim=-1))
     travelling = [names[capture.travelling_joint]]
     moved = 100 * (travel(clean) - travel(capture)).norm(dim=-1, keepdim=True)
     noise = [*zip(names, torch.rad2deg(inspection.noise).tolist(), strict=True)]
@@ -491,9 +465,7 @@ class LostPartFiller(Denoiser):
         motion = BodyPose(**{name: values[0] for name, values in vars(found.pose).items()}).motion()
         seconds = torch.arange(motion.num_frames, dtype=torch.float64) / PRIOR_FPS
         proposed = self.inbetweener.propose(GapQuery(motion, lost, seconds)).motion
-        root = torch.where(lost.root[:, None], proposed.root_position, motion.root_position)
-        quats = torch.where(lost.joints[..., None], proposed.local_quat_xyzw, motion.local_quat_xyzw)
-        pose = BodyPose.of_motion(replace(motion, root_position=root, local_quat_xyzw=quats))
+        pose = BodyPose.of_motion(restore_observed(proposed, motion, lost))
         return replace(found, pose=BodyPose(**{name: values[None] for name, values in vars(pose).items()}))
 
 

@@ -62,12 +62,15 @@ class DenoiseSolution(Solution):
             motion=self.motion.slice(start, stop),
             capture=self.capture.slice(start, stop),
             faults=move_frames(self.faults, -start, stop=stop - start),
-            contacts=self.contacts[part],
-            proposal_share=self.proposal_share[part],
-            error=self.error[part],
             density_intervals=move_frames(self.density_intervals, -start, stop=stop - start),
             ledger=self.ledger.pick(part),
+            **{name: values[part] for name, values in self.by_frame.items()},
         )
+
+    @property
+    def by_frame(self) -> dict[str, Tensor]:
+        """What there is for each frame at PRIOR_FPS."""
+        return {name: getattr(self, name) for name in ("contacts", "proposal_share", "error")}
 
     def details(self) -> dict[str, Any]:
         """Return noise, faults, corrections, contacts, fallbacks and densities, and compute of each frame."""
@@ -100,8 +103,8 @@ class DenoiseSolution(Solution):
 
     def correction(self) -> tuple[Float[Tensor, " joints"], Float[Tensor, " joints"]]:
         """Compute by joint of the rig the mean distance it was moved by, cm, and the mean angle in its parent, deg."""
-        rotation = rotations.multiply(rotations.inverse(self.capture.local_quat_xyzw), self.motion.local_quat_xyzw)
-        angle = torch.rad2deg(rotations.to_rotation_vector(rotation).norm(dim=-1))
+        turns = rotations.turns_between(self.capture.local_quat_xyzw, self.motion.local_quat_xyzw)
+        angle = torch.rad2deg(turns.norm(dim=-1))
         return 100 * self._measure_moves().mean(dim=0), angle.mean(dim=0)
 
     def find_largest_move(self) -> tuple[str, int, float]:
@@ -154,9 +157,7 @@ def _append_segment(whole: DenoiseSolution, piece: DenoiseSolution, start: int) 
         noise=(1 - share) * whole.noise + share * piece.noise,
         noise_root=(1 - share) * whole.noise_root + share * piece.noise_root,
         faults=_merge_faults(move_frames(whole.faults, 0, stop=skip), move_frames(piece.faults, start, skip, frames)),
-        contacts=torch.cat([whole.contacts[:kept], piece.contacts[skipped:]]),
-        proposal_share=torch.cat([whole.proposal_share[:kept], piece.proposal_share[skipped:]]),
-        error=torch.cat([whole.error[:kept], piece.error[skipped:]]),
+        **{name: torch.cat([values[:kept], getattr(piece, name)[skipped:]]) for name, values in whole.by_frame.items()},
         ledger=whole.ledger.slice(kept).join(piece.ledger.pick(slice(skipped, None))),
         seconds=whole.seconds + piece.seconds,
         windows=whole.windows + piece.windows,

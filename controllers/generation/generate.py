@@ -66,12 +66,12 @@ class PacePlan:
         self._pieces = deque[tuple[int, Density]](maxlen=1000)
         self._seen = 0
 
-    def condition(self, longest: int) -> tuple[Density, int]:
-        """Return the prior conditioned on the next pace, and for how many frames, at most `longest`, to sample it."""
+    def condition(self) -> tuple[Density, int]:
+        """Return the prior conditioned on the next pace, and for how many frames to sample it."""
         conditioned = self._conditioned.setdefault(self._pace, [self._prior])  # as many as their index
         while len(conditioned) <= self._emphasis:
             conditioned.append(conditioned[-1].conditioned_on([label_pace(self._pace)]))
-        return conditioned[self._emphasis], min(self._left, longest, _LOOK)
+        return conditioned[self._emphasis], min(self._left, _LOOK)
 
     def see(self, features: Float[Tensor, "frames size"]) -> None:
         """Go on after what was sampled."""
@@ -132,8 +132,6 @@ class GenerateSettings:
     def __post_init__(self):
         if not 0 <= self.temperature <= 2:
             raise RequestError(f"the temperature must lie between 0 and 2, got {self.temperature:g}")
-        if self.sigma_planted is not None and not self.sigma_planted > 0:
-            raise RequestError(f"the sigma of planted toes must be positive, got {self.sigma_planted:g}")
 
     def character(self, skeleton: Skeleton) -> Character:
         """Return the character with these bones, and the toe height at rest of the foot clean-up."""
@@ -244,8 +242,7 @@ def initialise_generation(
     prior: Density, settings: GenerateSettings, clip: Motion | None, generator: torch.Generator, *, scale: float = 1.0
 ) -> Beginning:
     """Begin at an initial state of the prior's, or unconditioned at the end of a clip, whose lengths are divided by
-    `scale`, the ratio of its performer's size to the prior's. RequestError for a start that the prior does not have.
-    """
+    `scale`, the ratio of its performer's size to the prior's. RequestError for a start that the prior does not have."""
     if clip is not None:
         canonical, _ = retarget.to_canonical(clip)
         if scale != 1.0:
@@ -275,12 +272,11 @@ def sample_pieces(
     settings: GenerateSettings | None = None,
     *,
     paces: PacePlan | None = None,
-    longest: int = _CHUNK,
 ) -> Iterator[Float[Tensor, "_ size"]]:
-    """Sample consecutive pieces of one motion, of at most `longest` frames, without end, conditioned on `paces`."""
+    """Sample consecutive pieces of one motion without end, conditioned on `paces`."""
     settings, prior, state = settings or GenerateSettings(), beginning.prior, beginning.state
     while True:
-        conditioned, count = (prior, longest) if paces is None else paces.condition(longest)
+        conditioned, count = (prior, _CHUNK) if paces is None else paces.condition()
         draw = conditioned.sample
         if settings.sigma_planted is not None:
             draw = partial(conditioned.sample_planted, sigma_speed=settings.sigma_planted)

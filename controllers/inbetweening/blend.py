@@ -5,16 +5,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from controllers.inbetweening.keyframes import effector_joint
 from controllers.inbetweening.pipeline import InbetweenSolution, InfillSettings, fill
 from controllers.inbetweening.tween import MIN_JERK_PEAK_ACCELERATION
 from mapctl import rotations
 from mapctl.errors import RequestError
-from mapctl.inbetweening.missing import MissingMask, restore_observed
-from mapctl.kinematics import heading, inverse
+from mapctl.inbetweening.effector_targets import bend_limb
+from mapctl.kinematics import heading
 from mapctl.motion import Motion
 from mapctl.protocols import Density, Inbetweener
+from mapctl.recording.masks import MissingMask, restore_observed
 from mapctl.retarget import from_canonical, to_canonical
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from mapctl.retarget.character import Stance
@@ -78,30 +81,33 @@ def blend(
     posed = own
     for limb in limbs:
         posed = _copy_limb(posed, own, other, limb, there)
-    before, after = _compute_margins(own, posed, limbs, there, transfer.margin)
-    free = slice(max(0, there.start - before), min(motion.num_frames, there.stop + after))
+    # Limbs go there and back in the margin that is given, or by their distance at a usual acceleration.
+    sides, ends = torch.tensor([there.start, there.stop - 1]), [limb.end for limb in limbs]
+    targets, starts = (each.pick(sides).joint_positions()[:, ends] for each in (posed, own))
+    distances, fps = (targets - starts).norm(dim=-1), float(own.fps)
+    counts = []
+    for far in distances.amax(dim=1).tolist():
+        usual = max(_MIN_MARGIN_SECONDS, math.sqrt(MIN_JERK_PEAK_ACCELERATION * far / _USUAL_HAND_ACCELERATION))
+        counts.append(round(fps * (usual if transfer.margin is None else transfer.margin)))
+    free = slice(max(0, there.start - counts[0]), min(motion.num_frames, there.stop + counts[1]))
     joints = [rigmap.joint_of[joint] for limb in limbs for joint in (limb.upper, limb.lower, limb.end)]
-    new = torch.zeros(motion.num_frames, motion.num_joints, dtype=torch.bool)
-    new[there] = True
-    moved = torch.zeros_like(new)
-    moved[:, [joint for joint in joints if joint is not None]] = True
-    nothing = torch.zeros(motion.num_frames, dtype=torch.bool)
-    transferred = restore_observed(from_canonical(posed, rigmap, motion), motion, MissingMask(new & moved, nothing))
-    margin_frames = torch.zeros_like(new)
-    margin_frames[free] = True
-    margin_frames[there] = False
-    missing = MissingMask(margin_frames & moved, nothing)
+    moved = torch.zeros(motion.num_joints, dtype=torch.bool)
+    moved[[joint for joint in joints if joint is not None]] = True
+    new, new_or_margin, nothing = torch.zeros(3, motion.num_frames, dtype=torch.bool)
+    new[there] = new_or_margin[free] = True
+    copied = MissingMask(new[:, None] & moved, nothing)
+    transferred = restore_observed(from_canonical(posed, rigmap, motion), motion, copied)
+    missing = MissingMask((new_or_margin & ~new)[:, None] & moved, nothing)
     done = fill(transferred, missing, inbetweener, settings=settings, densities=densities, terms=terms, rig=rig)
-    infeasible = _note_infeasible_margins(own, posed, transfer, limbs, free, there)
+    margins = (there.start, there.start - free.start), (there.stop - 1, free.stop - there.stop)
+    infeasible = _note_infeasible_margins(transfer, distances, margins, fps)
     status = done.status.with_notes(retargeted.notes).with_notes(infeasible, infeasible=bool(infeasible))
     status = status.with_notes([f"frames {free.start}:{free.stop} of {', '.join(transfer.limbs)} are new"])
-    return replace(done, missing=MissingMask((margin_frames | new) & moved, nothing), status=status)
+    return replace(done, missing=MissingMask(new_or_margin[:, None] & moved, nothing), status=status)
 
 
 def _copy_limb(posed: Motion, own: Motion, theirs: Motion, limb: Limb, there: slice) -> Motion:
-    """Copy one limb of a source on the same bones: its orientations relative to the hips' heading, and the vector from
-    its root to its effector.
-    """
+    """Copy one limb of a source on the same bones: its orientations relative to the hips, and where its effector is."""
     part = own.slice(there.start, there.stop)
     turn = rotations.about_y(heading(part.local_quat_xyzw[:, 0]) - heading(theirs.local_quat_xyzw[:, 0]))
     positions, quats = theirs.joint_positions(), part.local_quat_xyzw.clone()
@@ -111,49 +117,23 @@ def _copy_limb(posed: Motion, own: Motion, theirs: Motion, limb: Limb, there: sl
         wanted = rotations.multiply(turn, given[:, joint])
         quats[:, joint] = rotations.multiply(rotations.inverse(above), wanted)
         above = wanted
-    bent = replace(part, local_quat_xyzw=quats)
-    goals = bent.joint_positions().clone()
+    turned = replace(part, local_quat_xyzw=quats)
     limb_vector = rotations.rotate(turn, positions[:, limb.end] - positions[:, limb.upper])
-    goals[:, limb.end] = goals[:, limb.upper] + limb_vector
-    free = torch.zeros(goals.shape[:2], dtype=torch.bool)
-    free[:, [limb.upper, limb.lower]] = True
-    solved = inverse.solve_inverse_kinematics(
-        goals, quats, own.skeleton, free=free, limbs=(limb,), root_position=part.root_position
-    )
-    whole = posed.local_quat_xyzw.clone()
-    whole[there] = torch.where(free[..., None], solved, whole[there])
-    whole[there, limb.end] = quats[:, limb.end]
+    ends = turned.joint_positions()[:, limb.upper] + limb_vector
+    bent = bend_limb(turned, limb, ends, torch.ones(part.num_frames, dtype=torch.bool))
+    whole, joints = posed.local_quat_xyzw.clone(), [limb.upper, limb.lower, limb.end]
+    whole[there, joints] = bent.local_quat_xyzw[:, joints]
     return replace(posed, local_quat_xyzw=rotations.make_sign_continuous(whole))
 
 
-def _compute_margins(
-    own: Motion, posed: Motion, limbs: Sequence[Limb], there: slice, margin: float | None
-) -> tuple[int, int]:
-    """Compute the frames before and after in which limbs go there and back: by the margin if given, else by their
-    distance at a usual acceleration.
-    """
-    counts = []
-    for frame in (there.start, there.stop - 1):
-        distance = max(_compute_limb_distance(own, posed, limb, frame) for limb in limbs)
-        usual = max(_MIN_MARGIN_SECONDS, math.sqrt(MIN_JERK_PEAK_ACCELERATION * distance / _USUAL_HAND_ACCELERATION))
-        counts.append(round(float(own.fps) * (usual if margin is None else margin)))
-    return counts[0], counts[1]
-
-
-def _compute_limb_distance(own: Motion, posed: Motion, limb: Limb, frame: int) -> float:
-    """Compute the distance of a limb's effector between two motions in a frame, metres."""
-    there, here = (motion.slice(frame, frame + 1).joint_positions()[0, limb.end] for motion in (posed, own))
-    return float((there - here).norm())
-
-
 def _note_infeasible_margins(
-    own: Motion, posed: Motion, transfer: LimbTransfer, limbs: Sequence[Limb], free: slice, there: slice
-) -> tuple[str, ...]:
-    """Note limbs that are too fast in the margins, with numbers."""
-    notes, fps = [], float(own.fps)
-    for frame, count in ((there.start, there.start - free.start), (there.stop - 1, free.stop - there.stop)):
-        for name, limb in zip(transfer.limbs, limbs, strict=True):
-            distance = _compute_limb_distance(own, posed, limb, frame)
+    transfer: LimbTransfer, distances: Float[Tensor, "sides limbs"], margins: Sequence[tuple[int, int]], fps: float
+) -> list[str]:
+    """Note limbs that are too fast over their distances, metres, in the margins: the frame beside each, and how many
+    frames it has."""
+    notes = []
+    for (frame, count), row in zip(margins, distances.tolist(), strict=True):
+        for name, distance in zip(transfer.limbs, row, strict=True):
             needed = MIN_JERK_PEAK_ACCELERATION * distance * (fps / max(1, count)) ** 2
             if needed > _MAX_HAND_ACCELERATION:
                 notes.append(
@@ -161,4 +141,4 @@ def _note_infeasible_margins(
                     f"{needed:.0f} m/s^2; {_MAX_HAND_ACCELERATION:.0f} is the most that is common: a margin of "
                     f"{math.sqrt(MIN_JERK_PEAK_ACCELERATION * distance / _MAX_HAND_ACCELERATION):.2f} s would do"
                 )
-    return tuple(notes)
+    return notes

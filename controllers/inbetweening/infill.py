@@ -1,6 +1,5 @@
 """Fill the gaps of a motion: frames that are missing, or joints (Kaufmann et al. 2020, section 4.2); the hips'
-trajectory alone, predicted from the body (Zhou et al. 2020, section 3.4); or what lies between pieces of clips.
-"""
+trajectory alone, predicted from the body (Zhou et al. 2020, section 3.4); or what lies between pieces of clips."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +11,7 @@ from mapctl.curves.curve import Curve
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery, Proposal
-from mapctl.inbetweening.missing import MissingMask, interpolate_missing
+from mapctl.inbetweening.missing import interpolate_missing
 from mapctl.inbetweening.query import estimate_contact_logits
 from mapctl.inbetweening.root_trajectory import TREMBLE_HZ, LocalMotion, close_path
 from mapctl.kinematics import heading
@@ -21,7 +20,7 @@ from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
 from mapctl.numerics.smooth_offsets import smooth_between
 from mapctl.protocols import Density, Inbetweener, PathPredictor
-from mapctl.recording.masks import ALL, Mask, expand_masks, resolve_joint_names
+from mapctl.recording.masks import ALL, Mask, MissingMask, expand_masks, resolve_joint_names
 from mapctl.retarget import identify_rig
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from mapctl.retarget.rigs import Rig
@@ -45,8 +44,7 @@ class RetracedInbetweener(Inbetweener):
 
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
         """Propose the poses' motion along the predicted trajectory, which leads from the last known position of the
-        hips to the next. Gaps in which nothing at all is known keep the trajectory that was proposed with them.
-        """
+        hips to the next. Gaps in which nothing at all is known keep the trajectory that was proposed with them."""
         if self.poses is None:
             posed = Proposal(query.motion, estimate_contact_logits(query.motion), "path")
         else:
@@ -86,7 +84,7 @@ def infill(
     """
     masks = resolve_joint_names(motion, masks, rig)
     # The rig must not be identified from values within a gap.
-    shown = interpolate_missing(motion, MissingMask(*expand_masks(motion, masks)))
+    shown = interpolate_missing(motion, expand_masks(motion, masks))
     missing = MissingMask.of_masks(motion, masks, identify_rig(shown.skeleton, rig, motion=shown))
     if curve is not None and not missing.root.any():
         raise RequestError("the hips follow a curve where they are missing, and they never are; leave it out")
@@ -122,14 +120,14 @@ def retraced(
     masks that do not fit, for gaps without an in-betweener, and for gaps in a motion without any position.
     """
     masks = resolve_joint_names(motion, masks, rig)
-    joints, root = expand_masks(motion, masks)
-    if bool(joints.any()) and inbetweener is None:
+    lost = expand_masks(motion, masks)
+    if bool(lost.joints.any()) and inbetweener is None:
         raise RequestError("joints are missing as well as the trajectory; an in-betweener must propose them")
-    if bool(root.all()) and bool(joints.any()):
+    if bool(lost.root.all()) and bool(lost.joints.any()):
         raise RequestError("the trajectory is lost over all frames of a motion whose joints are lost as well")
-    if not bool(root.any()):
+    if not bool(lost.root.any()):
         raise RequestError("no frame's trajectory is lost; there is nothing to predict")
-    shown = interpolate_missing(motion, MissingMask(joints, root))
+    shown = interpolate_missing(motion, lost)
     rigmap = identify_rig(shown.skeleton, rig, motion=shown)
     return fill(
         motion,
@@ -196,8 +194,7 @@ def chain(
         gap = int(torch.randint(settings.gap[0], settings.gap[1] + 1, (), generator=generator))
         masks.append(Mask(ALL, whole.num_frames, whole.num_frames + gap))
         piece = _align_to_predecessor(whole, piece, gap)
-        last = torch.full((gap,), whole.num_frames - 1)
-        held = replace(whole, root_position=whole.root_position[last], local_quat_xyzw=whole.local_quat_xyzw[last])
+        held = whole.pick(torch.full((gap,), whole.num_frames - 1))
         whole = whole.join(held).join(piece)
     assert whole is not None, "there are clips"
     done = infill(

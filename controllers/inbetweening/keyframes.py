@@ -22,7 +22,7 @@ from torch import Tensor
 from mapctl import formats, joint_ranges, rotations
 from mapctl.errors import MapctlError, RequestError
 from mapctl.inbetweening.effector_targets import EffectorTargets, LooseKeys, estimate_size, measure_floor, view_axes
-from mapctl.inbetweening.missing import MissingMask, interpolate_missing
+from mapctl.inbetweening.missing import interpolate_missing
 from mapctl.inbetweening.pose_pairs import (
     TRAVELLING_DISTANCE,
     TimingModel,
@@ -34,6 +34,7 @@ from mapctl.intent.keyframes import Drawing, Key, KeyEntry, KeyRequest, Keys, re
 from mapctl.joint_names import classify_joint, describe_nearest, find_joint
 from mapctl.kinematics import forward_kinematics, heading
 from mapctl.motion import Motion, join_licences
+from mapctl.recording.masks import MissingMask
 from mapctl.retarget import RigMap, as_rig, from_canonical, rig_joint_positions, to_canonical
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from mapctl.retarget.rigs import Rig
@@ -208,8 +209,7 @@ def resolve_drawing(drawing: Drawing, rigmap: RigMap) -> dict[int, tuple[float, 
 def effector_joint(name: str, rigmap: RigMap) -> int:
     """Find the canonical joint of an effector, by its canonical name or the rig's own in any case; RequestError, with
     the nearest name, for anything else."""
-    names = rigmap.rig_skeleton.names
-    known = {c: joint for c, joint in zip(CANONICAL.names, rigmap.joint_of, strict=True) if joint is not None}
+    names, known = rigmap.rig_skeleton.names, rigmap.joints
     ends = {known[end]: CANONICAL.index(end) for end in LIMBS if end in known}
     joint = find_joint(name, names, lambda: known)
     if joint in ends:
@@ -222,17 +222,17 @@ def _find_half(half: str, rigmap: RigMap) -> Bool[Tensor, " joints"]:
     """Find the joints of a rig that belong to a half of the body. Those that no canonical joint is belong to that which
     the nearest one below them does, or else above; the upper half has what hangs on the hips besides."""
     parents = rigmap.rig_skeleton.parents
-    legs = {joint: _is_leg(name) for name, joint in rigmap.joints.items() if name != CANONICAL.names[0]}
+    legs = {
+        joint: name.endswith(("Leg", "Foot", "Toes"))
+        for name, joint in rigmap.joints.items()
+        if name != CANONICAL.names[0]
+    }
     for joint in reversed(range(len(parents))):  # upwards, from what hangs below
         if joint in legs and parents[joint] >= 0 and parents[joint] != rigmap.joint_of[0]:
             legs.setdefault(parents[joint], legs[joint])
     for joint, parent in enumerate(parents):
-        legs.setdefault(joint, legs.get(parent, False) if parent != rigmap.joint_of[0] else False)
+        legs.setdefault(joint, parent != rigmap.joint_of[0] and legs.get(parent, False))
     return torch.tensor([legs[joint] == (half == "lower") for joint in range(len(parents))])
-
-
-def _is_leg(name: str) -> bool:
-    return name.endswith(("Leg", "Foot", "Toes"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,8 +252,7 @@ def build_keyframe_clip(
 ) -> KeyframeClip:
     """Build the motion and the keys of a request. RequestError, which names the key, for poses and joints that do not
     exist; `rig` is the body's where it is not the one that would be recognised. `on_read` is called with each file that
-    is read, its motion and its rig.
-    """
+    is read, its motion and its rig."""
     first = next((number for number, key in enumerate(request.key) if key.pose is not None), 0)
     body_path = request.body or request.key[first].pose or ""
     loaded: dict[str, tuple[Motion, Motion]] = {}  # clips as read, and on canonical joints with the body's bones
@@ -333,13 +332,7 @@ def _interpolate_poses(poses: dict[int, Motion], frames: int) -> Motion:
     at = torch.tensor(sorted(poses))
     joined = reduce(Motion.join, (poses[frame] for frame in sorted(poses)))
     source = (torch.searchsorted(at, torch.arange(frames), right=True) - 1).clamp_min(0)
-    moving = {joint: values[source] for joint, values in joined.moving_offsets.items()}
-    motion = replace(
-        joined,
-        root_position=joined.root_position[source],
-        moving_offsets=moving,
-        local_quat_xyzw=rotations.make_sign_continuous(joined.local_quat_xyzw)[source],
-    )
+    motion = replace(joined, local_quat_xyzw=rotations.make_sign_continuous(joined.local_quat_xyzw)).pick(source)
     free = torch.ones(frames, dtype=torch.bool)
     free[at] = False
     return interpolate_missing(motion, MissingMask.of_frames(free, motion.num_joints))
@@ -402,15 +395,11 @@ class KeyInterval:
 
 def suggest_intervals(motion: Motion, keys: Keys, timing: TimingModel, rig: Rig | None = None) -> list[KeyInterval]:
     """Suggest the time between neighbouring keyframes that are whole poses; others may lie between. RequestError for
-    keys that do not fit the motion, and for fewer than two such poses.
-    """
+    keys that do not fit the motion, and for fewer than two such poses."""
     key_frames = [key.frame for key in keys.checked(motion) if key.what == "pose"]
     if len(key_frames) < 2:
         raise RequestError(f"timing is suggested between whole poses; the keys have {len(key_frames)}, it takes two")
-    picked = torch.tensor(key_frames)
-    moving = {joint: values[picked] for joint, values in motion.moving_offsets.items()}
-    poses = Motion(motion.skeleton, motion.fps, motion.root_position[picked], motion.local_quat_xyzw[picked], moving)
-    canonical = to_canonical(poses, rig)[0]
+    canonical = to_canonical(motion.pick(torch.tensor(key_frames)), rig)[0]
     scale, fps = leg_length(canonical.skeleton) / leg_length(CANONICAL), float(motion.fps)
     body = Motion(CANONICAL, canonical.fps, canonical.root_position / scale, canonical.local_quat_xyzw)
     first = torch.arange(len(key_frames) - 1)

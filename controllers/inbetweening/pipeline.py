@@ -1,6 +1,5 @@
 """Fill missing frames or joints of a motion on any rig: an in-betweener proposes, MAP refines the proposal, and what is
-known stays to the bit.
-"""
+known stays to the bit."""
 
 import math
 import time
@@ -30,17 +29,18 @@ from mapctl.inbetweening.effector_targets import (
     lead_over_positions,
     reach_effector_targets,
 )
-from mapctl.inbetweening.missing import MissingMask, interpolate_missing, restore_observed
+from mapctl.inbetweening.missing import blend_seams, interpolate_missing
 from mapctl.inbetweening.query import GapSource
 from mapctl.inbetweening.root_trajectory import lead_over_keys
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
-from mapctl.numerics.intervals import true_intervals
-from mapctl.numerics.smooth_offsets import blend_seams_in_positions, blend_seams_in_rotations, interpolate_offsets
+from mapctl.numerics.intervals import true_intervals, widen
+from mapctl.numerics.smooth_offsets import interpolate_offsets
 from mapctl.problem.solution import Ledger, Outcome, Solution, Status
 from mapctl.protocols import Density, Inbetweener
 from mapctl.recording import Capture
 from mapctl.recording.fusion import transfer_change
+from mapctl.recording.masks import MissingMask, restore_observed
 from mapctl.retarget import RigMap, as_rig, from_canonical, rig_joint_positions, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL
@@ -185,7 +185,10 @@ def fill(
     unknown = MissingMask(query.missing.joints, unknown_root)
     spread = answer.spread
     trust = None if spread is None else (spread[..., 0] / _USUAL_ERROR).clamp(*_TRUST_RANGE).float()
-    for first, last in _find_windows(unknown.frames) if settings.refine else ():
+    near = widen(unknown.frames, _CONTEXT_FRAMES) & settings.refine  # gaps whose contexts overlap are one window
+    for _, first, last in true_intervals(near[:, None]):
+        if last - first < 2:
+            continue
         part, part_unknown = slice(first, last), unknown.slice(first, last)
         proposal = canonical.slice(first, last)
         refined = refine(
@@ -229,14 +232,6 @@ def fill(
         sources=answer.attribute(query),
         gap_notes=_note_gaps(query, answer, fps=float(motion.fps)),
     )
-
-
-def _find_windows(missing: Bool[Tensor, " frames"]) -> list[tuple[int, int]]:
-    """Find first frame and one past the last of each gap with its context; gaps whose contexts overlap are merged."""
-    near = missing.clone()
-    for _, start, stop in true_intervals(missing[:, None]):
-        near[max(0, start - _CONTEXT_FRAMES) : stop + _CONTEXT_FRAMES] = True
-    return [(start, stop) for _, start, stop in true_intervals(near[:, None]) if stop - start > 1]
 
 
 _TIE_FRAMES = 1e-6  # frames
@@ -286,29 +281,22 @@ class CanonicalClip:
         snapped = missing_values[best].sum(dim=1) < (missing_values[low] | missing_values[high]).sum(dim=1)
         at = torch.where(snapped, best.to(at), at)
         low, high = torch.where(snapped, best, low), torch.where(snapped, best, high)
-        quats = torch.where(snapped[:, None, None], canonical.local_quat_xyzw[best], whole.local_quat_xyzw)
-        root = torch.where(snapped[:, None], canonical.root_position[best], whole.root_position)
-        shown = replace(whole, root_position=root, local_quat_xyzw=rotations.make_sign_continuous(quats))
-        joints, seconds = self._missing_canonical_joints(), at / float(canonical.fps)
-        if effector_targets is not None:
-            effector_targets = effector_targets.shown(seconds, fps=float(canonical.fps))
-        if loose is not None:
-            loose = loose.shown(seconds, fps=float(canonical.fps))
-        mask = MissingMask(joints[low] | joints[high], missing.root[low] | missing.root[high])
-        return GapQuery(shown, mask, seconds, effector_targets, keep_trajectory, loose)
+        shown = restore_observed(canonical.pick(best), whole, MissingMask.of_frames(snapped, canonical.num_joints))
+        shown = replace(shown, local_quat_xyzw=rotations.make_sign_continuous(shown.local_quat_xyzw))
+        joints, fps = self._missing_canonical_joints(), float(canonical.fps)
+        seconds, mask = at / fps, MissingMask(joints[low] | joints[high], missing.root[low] | missing.root[high])
+        targets = effector_targets and effector_targets.shown(seconds, fps=fps)
+        return GapQuery(shown, mask, seconds, targets, keep_trajectory, loose and loose.shown(seconds, fps=fps))
 
     def back(self, generated: Motion, query: GapQuery) -> Motion:
         """Return an answer to the query on the rig, at the clip's rate, with blended seams and what is known to the
-        bit. If the answer is the query's own interpolation, return the interpolation on the rig.
-        """
+        bit. If the answer is the query's own interpolation, return the interpolation on the rig."""
         filled = self.interpolated
         if generated is not query.motion or query.keep_trajectory or query.loose is not None:
-            at_prior_rate = self.canonical.fps == PRIOR_FPS
-            own = (
-                generated if at_prior_rate else transfer_change(self.canonical, query.motion, generated, query.seconds)
-            )
-            filled = from_canonical(own, self.rigmap, self.interpolated)
-            filled = self._blend_seams(restore_observed(filled, self.interpolated, self.missing))
+            if self.canonical.fps != PRIOR_FPS:
+                generated = transfer_change(self.canonical, query.motion, generated, query.seconds)
+            filled = from_canonical(generated, self.rigmap, self.interpolated)
+            filled = blend_seams(restore_observed(filled, self.interpolated, self.missing), self.missing)
         return self.restore_observed(filled)
 
     def restore_observed(self, motion: Motion) -> Motion:
@@ -322,19 +310,6 @@ class CanonicalClip:
             columns.append(columns[CANONICAL.parents[joint]] if own is None else self.missing.joints[:, own])
         return torch.stack(columns, dim=1)
 
-    def _blend_seams(self, filled: Motion) -> Motion:
-        fps, missing = float(self.original.fps), self.missing
-        moving = {
-            joint: blend_seams_in_positions(values, missing.root, fps=fps)
-            for joint, values in filled.moving_offsets.items()
-        }
-        return replace(
-            filled,
-            moving_offsets=moving,
-            root_position=blend_seams_in_positions(filled.root_position, missing.root, fps=fps),
-            local_quat_xyzw=blend_seams_in_rotations(filled.local_quat_xyzw, missing.joints, fps=fps),
-        )
-
 
 def _resample_to_end(canonical: Motion) -> Motion:
     """Resample to PRIOR_FPS; an end that is far from the last frame there gets a frame of its own."""
@@ -344,18 +319,14 @@ def _resample_to_end(canonical: Motion) -> Motion:
     if over <= Fraction(1, 2):
         return canonical.resample(PRIOR_FPS)
     frame = torch.arange(canonical.num_frames + math.ceil(canonical.fps / PRIOR_FPS)).clamp(max=last)
-    held = replace(
-        canonical, root_position=canonical.root_position[frame], local_quat_xyzw=canonical.local_quat_xyzw[frame]
-    )
-    return held.resample(PRIOR_FPS).slice(0, moments + 1)
+    return canonical.pick(frame).resample(PRIOR_FPS).slice(0, moments + 1)
 
 
 def _find_most_complete_frames(
     at: Float[Tensor, " shown"], missing_counts: Int[Tensor, " frames"]
 ) -> Int[Tensor, " shown"]:
     """Find for each time, in frames of the clip, the frame with the fewest missing values of those nearer to it than to
-    another time; the nearest of several; any other frame if there is none.
-    """
+    another time; the nearest of several; any other frame if there is none."""
     edges = (at[1:] + at[:-1]) / 2 + _TIE_FRAMES  # a frame midway between two times belongs to the earlier one
     beyond = at.new_full((1,), torch.inf)
     own, last = at.round().long(), len(missing_counts) - 1
@@ -374,11 +345,8 @@ _MAX_EDGE_DISTANCE = 1.0  # metres from a gap's edge to the curve
 
 def _lead_along_curve(motion: Motion, missing: Bool[Tensor, " frames"], curve: Curve) -> Motion:
     """Move and orient the hips of a canonical motion along the curve, at constant speed, in frames in which they are
-    missing.
-
-    The offset from the curve is interpolated from one edge of a gap to the other. RequestError for a gap that begins or
-    ends far from the curve.
-    """
+    missing. The offset from the curve is interpolated from one edge of a gap to the other. RequestError for a gap that
+    begins or ends far from the curve."""
     if curve.dims != 2:
         raise RequestError("the hips follow a curve on the ground, of x and z")
     root, quats = motion.root_position.clone(), motion.local_quat_xyzw.clone()

@@ -31,6 +31,7 @@ from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root
 from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.effector_targets import EffectorTargets
+from mapctl.inbetweening.missing import blend_seams
 from mapctl.inbetweening.query import INTERPOLATION, GapSource, estimate_contact_logits
 from mapctl.inbetweening.whole_body import bend_limbs, reach_targets
 from mapctl.kinematics import heading
@@ -38,17 +39,13 @@ from mapctl.metrics.body import measure_path_length, measure_peaks
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
 from mapctl.numerics.intervals import fill_missing, last_observed, next_observed, true_intervals
-from mapctl.numerics.smooth_offsets import (
-    blend_seams_in_positions,
-    blend_seams_in_rotations,
-    interpolate_offsets,
-    interpolate_turns,
-)
+from mapctl.numerics.smooth_offsets import interpolate_offsets, interpolate_turns
 from mapctl.pose import decode
 from mapctl.problem import density_selection
 from mapctl.problem.receding_horizon import CommittedFrames, RecedingHorizonSolver, replay
 from mapctl.problem.window_solvers import LatentNoiseSolver, SolvedWindow, SteeringKnots, SwarmProposal, keep_warm_start
 from mapctl.protocols import Density, DensityState, Inbetweener
+from mapctl.recording.masks import MissingMask
 from mapctl.skeleton import CANONICAL, LIMBS, TOE_JOINTS, TOES
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
@@ -79,8 +76,7 @@ def propose_through_keys(
     query: GapQuery, inbetweener: Inbetweener, generator: torch.Generator | None
 ) -> tuple[Proposal, EffectorTargets | None]:
     """Propose a motion with hands and feet at their targets, and the hips at theirs in frames that give no more; also
-    return the targets, moved within reach where they are not.
-    """
+    return the targets, moved within reach where they are not."""
     hips, targets, wanted = _find_partial_keys(query)
     if not bool((hips | wanted).any()):
         return inbetweener.propose(query, generator=generator), targets
@@ -192,9 +188,7 @@ def _interpolate_trajectory(
 
 
 def _estimate_root_uncertainty(body: Motion, missing: Bool[Tensor, " frames"]) -> Float[Tensor, " frames"]:
-    """Estimate the uncertainty of proposed hips, metres: proportional to their speed and to the time from the nearest
-    known frame.
-    """
+    """Estimate the uncertainty of proposed hips, metres: by their speed and the time from the nearest known frame."""
     known, frame, fps = ~missing[None], torch.arange(len(missing)), float(body.fps)
     before, after = last_observed(known)[0], next_observed(known)[0]
     seconds = torch.minimum((frame - before).abs(), (after - frame).abs()) / fps
@@ -264,10 +258,7 @@ def _blend_key_poses(body: Motion, posed: Motion, keys: Bool[Tensor, " frames"],
         (posed.root_position - body.root_position) * keys[:, None], ~query.missing.root | keys, seconds=trunk, fps=fps
     )
     generated = replace(body, root_position=body.root_position + offset, local_quat_xyzw=quats)
-    goals_generated, wanted = (
-        generated.joint_positions(),
-        torch.zeros(generated.num_frames, CANONICAL.num_joints, dtype=torch.bool),
-    )
+    goals_generated, wanted = generated.joint_positions(), torch.zeros_like(query.missing.joints)
     for foot in _FEET:
         firm = keys | ~query.missing.joints[:, CANONICAL.parents[foot]]
         goals_generated[:, foot] = positions[:, foot] + interpolate_offsets(
@@ -468,8 +459,7 @@ def commit_before(
     since: int = 0,
 ) -> CommittedFrames:
     """Commit a motion's frames before a gap, with their contacts, single precision; a density's `state` is advanced
-    from frame `since` on.
-    """
+    from frame `since` on."""
     features, before = encode(body.slice(0, max(2, start)))
     ground, heading = integrate_root(features, before)
     features[:, LAYOUT.slices["contacts"]] = (contact_logits[: len(features)] > 0).to(features)
@@ -487,8 +477,7 @@ def insert_rollout(
     gap: tuple[int, int],
 ) -> tuple[Motion, Float[Tensor, "frames 2"]]:
     """Insert a rollout in its gap, corrected so that it arrives at the frame after it, if there is one; also return the
-    contact logits.
-    """
+    contact logits."""
     start, stop = gap
     generated = decode(
         window.trial.features[0], GroundPose(ground_pose.position_xz.double(), ground_pose.heading.double())
@@ -501,10 +490,9 @@ def insert_rollout(
         root[start:stop], quats[start:stop] = _arrive(here, there, root[start:stop], quats[start:stop])
     new = torch.zeros(len(root), dtype=torch.bool)
     new[start:stop] = True
-    root = blend_seams_in_positions(root, new, fps=PRIOR_FPS)
-    quats = blend_seams_in_rotations(quats, new[:, None].expand(-1, CANONICAL.num_joints), fps=PRIOR_FPS)
     logits[start:stop] = contacts.to_logits(planted[:count]).to(logits)
-    return replace(body, root_position=root, local_quat_xyzw=quats), logits
+    filled = replace(body, root_position=root, local_quat_xyzw=quats)
+    return blend_seams(filled, MissingMask.of_frames(new, body.num_joints)), logits
 
 
 def _arrive(
@@ -512,9 +500,7 @@ def _arrive(
 ) -> tuple[Float[Tensor, "frames 3"], Float[Tensor, "frames joints 4"]]:
     """Spread what a rollout arrives `here` instead of `there` over all its frames: none of it in the two frames before,
     all of it in two after, so that it leaves and arrives at its own pace."""
-    turn = rotations.to_rotation_vector(
-        rotations.multiply(rotations.inverse(here.local_quat_xyzw), there.local_quat_xyzw)
-    )
+    turn = rotations.turns_between(here.local_quat_xyzw, there.local_quat_xyzw)
     firm = torch.ones(len(root) + 4, dtype=torch.bool)
     firm[2:-2] = False
     miss = root.new_zeros(len(firm), 3 + 3 * quats.shape[1])
@@ -704,8 +690,7 @@ _AT_REST = 0.15  # mean speed of the joints beside a gap, m/s, below which the b
 @dataclass(frozen=True, eq=False)
 class AutoInbetweener(Inbetweener):
     """In-betweener that takes a network's proposal, except in gaps that are a tweener's or a stitcher's and where a
-    pose is held; the end is extrapolated by a density.
-    """
+    pose is held; the end is extrapolated by a density."""
 
     network: Inbetweener
     """In-betweener that proposes first, and fills gaps in which something is known."""
@@ -814,9 +799,7 @@ def _fill_from(proposal: Proposal, generated: Proposal, query: GapQuery, gaps: S
 
 
 def _is_standing_still(query: GapQuery, start: int, stop: int) -> bool:
-    """Return whether the body has the same whole pose and position before and after a gap, and is at rest in known
-    frames beside it.
-    """
+    """Return whether the body rests in the same whole pose and position before and after a gap."""
     targets = query.effector_targets
     given = targets is not None and bool(targets.wanted[start:stop].any())
     if stop - start < _HELD or query.keep_trajectory or given or _is_beside_part(query, start, stop):

@@ -16,11 +16,12 @@ from torch import Tensor
 
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery, Proposal
-from mapctl.inbetweening.missing import MissingMask, compute_velocity_share, interpolate_missing
+from mapctl.inbetweening.missing import compute_velocity_share, interpolate_missing
 from mapctl.inbetweening.query import GapSource, estimate_contact_logits
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
 from mapctl.protocols import Inbetweener
+from mapctl.recording.masks import MissingMask
 
 _SHARPNESS = 1.75  # s above: over unseen clips and their copies in varied poses the error is flat from 1.5 to 2.5
 _TEST_NOISE = 0.5  # variance of a test's logarithm over that between clips, over the same

@@ -1,6 +1,5 @@
 """In-betweening of keyframes. What a key gives is no unknown, so it is met to the bit; where it gives only the position
-of a hand or a foot, the limb is bent to reach it.
-"""
+of a hand or a foot, the limb is bent to reach it."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -20,10 +19,11 @@ from controllers.inbetweening.keyframes import (
 from controllers.inbetweening.pipeline import InbetweenSolution, InfillSettings, fill
 from mapctl import joint_ranges, rotations
 from mapctl.inbetweening.effector_targets import EffectorTargets, LooseKeys
-from mapctl.inbetweening.missing import MissingMask, interpolate_missing
+from mapctl.inbetweening.missing import interpolate_missing
 from mapctl.intent.keyframes import Key, Keys
 from mapctl.motion import Motion
 from mapctl.protocols import Density, Inbetweener
+from mapctl.recording.masks import MissingMask
 from mapctl.retarget import RigMap, as_rig, identify_rig, rig_joint_positions, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.terms import Term
@@ -62,8 +62,7 @@ def check_keyframes(
         if speed > _MAX_ROOT_SPEED:
             notes.append(f"the hips need {speed:.1f} m/s between frames {start} and {stop}, faster than anyone runs")
     for start, stop in _pairs(known):
-        one, other = motion.local_quat_xyzw[[start, stop]]
-        turns = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(one), other)).norm(dim=-1)
+        turns = rotations.turns_between(*motion.local_quat_xyzw[[start, stop]]).norm(dim=-1)
         rates = turns * ~(missing.joints[start] | missing.joints[stop]) * fps / (stop - start)
         worst = int(rates.argmax())
         if (rate := float(rates[worst])) > _MAX_JOINT_RATE:
@@ -156,8 +155,7 @@ def tween(
 
 def keyframe_motion(wanted: Sequence[Key], motion: Motion, rig: Rig | None) -> tuple[Motion, RigMap, Motion]:
     """Return the keys with an interpolation between them: on canonical joints, with the map of the rig, which is
-    identified from these, and on the rig.
-    """
+    identified from these, and on the rig."""
     free = torch.ones(motion.num_frames, dtype=torch.bool)
     # Where keys tell no rotation at all, the rig is known by the pose at any of them.
     free[[key.frame for key in wanted if key.shown] or [wanted[0].frame]] = False
@@ -180,8 +178,8 @@ def measure_keyframe_errors(
     rigmap = keyframe_motion(wanted, source, rig)[1]
     hips = rigmap.joint_of[0]
     distance = 100 * (generated.joint_positions() - source.joint_positions()).norm(dim=-1)
-    rotation = rotations.multiply(rotations.inverse(source.joint_rotations()), generated.joint_rotations())
-    angles = torch.rad2deg(rotations.to_rotation_vector(rotation).norm(dim=-1))
+    turns = rotations.turns_between(source.joint_rotations(), generated.joint_rotations())
+    angles = torch.rad2deg(turns.norm(dim=-1))
     targets = collect_effector_targets(wanted, source, rigmap)
     loose = collect_loose_keys(wanted, source, rigmap)
     known = ~missing_between_keys(wanted, source, rigmap).joints

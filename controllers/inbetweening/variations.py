@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from controllers.common.map_refinement import RefinementSettings, estimate_rest_height
+from controllers.common.map_refinement import estimate_rest_height
 from controllers.inbetweening.pipeline import INFILL_REFINEMENT, InbetweenSolution
 from controllers.inbetweening.proposers import (
     EVERY_ROLLOUT_JUMPED,
@@ -26,22 +26,15 @@ from mapctl.problem.solution import Ledger
 from mapctl.protocols import Density, Inbetweener
 from mapctl.retarget import to_canonical
 from mapctl.retarget.rigs import Rig
-from mapctl.terms import Clearance, Jerk, Likelihood, Support, Term
+from mapctl.terms import Likelihood, Support, Term
 from mapctl.terms.trial import Trial
 
 _PRECEDING_FRAMES = 3  # frames before those that are scored, on which terms look back
 
 
-def score(
-    motion: Motion,
-    contacts: Bool[Tensor, "frames 2"],
-    density: Density,
-    settings: RefinementSettings,
-    rig: Rig | None = None,
-) -> Ledger:
+def score(motion: Motion, contacts: Bool[Tensor, "frames 2"], density: Density, rig: Rig) -> Ledger:
     """Compute the energy by term (likelihood under a density, contact, clearance, support, jerk) of a motion on any rig
-    of more than three frames at the prior's rate; `contacts` are its contacts at that rate.
-    """
+    of more than three frames at the prior's rate; `contacts` are its contacts at that rate."""
     canonical = to_canonical(motion, rig)[0].resample(PRIOR_FPS)
     bits = contacts[: canonical.num_frames]
     features, before = encode(canonical)
@@ -55,12 +48,15 @@ def score(
     with torch.no_grad():
         log_density = blurred.log_prob(shown, state)
     height = estimate_rest_height(canonical, bits)[_PRECEDING_FRAMES:]
+    clearance, jerk = INFILL_REFINEMENT.clearance, INFILL_REFINEMENT.jerk
+    assert clearance is not None
+    assert jerk is not None
     terms: list[Term] = [
-        Likelihood(settings.temperature),
-        replace(settings.footing, supports=height),
-        replace(settings.clearance or Clearance(), rest_height=height),
+        Likelihood(INFILL_REFINEMENT.temperature),
+        replace(INFILL_REFINEMENT.footing, supports=height),
+        replace(clearance, rest_height=height),
         Support(rest_height=height),
-        settings.jerk or Jerk(sigma=50.0, frames=len(features)),
+        jerk,
     ]
     planted = features[:, LAYOUT.slices["contacts"]] > 0.5
     trial = Trial(
@@ -127,7 +123,6 @@ def sample_variations(
     *,
     generator: torch.Generator,
     source: Source | None = None,
-    refinement: RefinementSettings = INFILL_REFINEMENT,
     progress: Callable[[int, int], None] | None = None,
 ) -> Variations:
     """Make so many motions through the same keys. The first ones do not depend on the count.
@@ -155,5 +150,5 @@ def sample_variations(
         jumped = any(gap.reason == EVERY_ROLLOUT_JUMPED for other in found[1:] for gap in other.sources)
         cause = f"{EVERY_ROLLOUT_JUMPED} between these keys" if jumped else f"no two keys have {source.room}"
         raise RequestError(f"{cause}, which leaves nothing to vary")
-    each = (Variation(one, score(one.motion, one.contacts, density, refinement, one.rig)) for one in found)
+    each = (Variation(one, score(one.motion, one.contacts, density, one.rig)) for one in found)
     return Variations(tuple(each), measure_diversity([one.motion for one in found]))

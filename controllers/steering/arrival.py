@@ -16,14 +16,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from controllers.steering.steer import KEPT_FRAMES, Approach, Refusal, SteerFrames, SteerState, condition_prior, step
+from controllers.steering.steer import (
+    KEPT_FRAMES,
+    Approach,
+    Refusal,
+    SteerFrames,
+    SteerState,
+    condition_prior,
+    deliver,
+    step,
+)
 from mapctl import rotations
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root, reversed_features
 from mapctl.intent.steering import Arrival, Command, SteeringTarget
-from mapctl.motion import Motion
 from mapctl.pose import decode
 from mapctl.problem.receding_horizon import CommittedFrames, replay
-from mapctl.problem.solution import Ledger, Outcome, Status
 from mapctl.runtime.stepwise import StepwiseWork
 
 LEAST_FRAMES = 4
@@ -55,30 +62,6 @@ class TransitionMaker(Protocol):
         runs backwards, `frames` later, at `position`, metres, and turned by `turn`, relative to the last of `before`.
         """
         ...
-
-
-def begin_stitch(
-    transitions: TransitionMaker,
-    state: SteerState,
-    command: Command,
-    order: Arrival,
-    frames: int,
-    *,
-    planned: Float[Tensor, "ahead size"],
-) -> tuple[Float[Tensor, "held size"], StepwiseWork[Float[Tensor, "rest size"]]]:
-    """Begin the stitch to a target, so many frames away: return features of the first frames, which play meanwhile,
-    and the work that computes the others.
-
-    The first are those of the next step as they were `planned` before; there are none where no time is left for
-    the rest after them.
-    """
-    held = planned[: state.settings.commit]
-    if frames - len(held) < LEAST_FRAMES:
-        held = held[:0]
-    there = replace(state, committed=commit_frames(state, held)) if len(held) else state
-    if len(held) and needed_speed(there, order, frames - len(held)) > state.prior.limits.max_steering_speed:
-        there, held = state, held[:0]
-    return held, StepwiseWork(plan_stitch(transitions, there, command, order, frames - len(held)))
 
 
 def commit_frames(state: SteerState, new: Float[Tensor, "frames size"]) -> CommittedFrames:
@@ -130,12 +113,8 @@ def _pose_candidates(state: SteerState, command: Command, order: Arrival) -> Flo
     """Frames at the position run backwards, the pose there last: the given pose alone, or moments of the prior and how
     motion continues from them."""
     if order.pose is not None:
-        pose = order.pose
-        still = Motion(
-            pose.skeleton, pose.fps, pose.root_position.expand(2, -1), pose.local_quat_xyzw.expand(2, -1, -1)
-        )
-        return encode(still)[0][:1].float()[None]
-    prior = condition_prior(state.prior, command.labels) if command.labels else state.prior
+        return encode(order.pose.pick(torch.zeros(2, dtype=torch.long)))[0][:1].float()[None]
+    prior = condition_prior(state.prior, command.labels)
     starts = prior.initial_states
     speed = command.speed / state.character.scale
     near = (starts.speed - speed).abs().argsort()[:_CANDIDATES]
@@ -158,7 +137,6 @@ def _measure_roughness(state: SteerState, motions: Float[Tensor, "batch frames s
 
 _STITCHED_FRAMES = 45  # at the end of a motion that is walked first
 _LEAST_SPEED = 0.3  # m/s below which the character does not set out: there is time to stand first
-_PAST_FRAMES = 60  # of targets that are kept for terms that look back
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,10 +156,10 @@ class Arriver:
         approach = state.approach
         if order is None:
             return step(replace(state, approach=Approach(None, plain)), plain, seconds=seconds)
-        left, new = _arrival_frame(order) - state.frames + 1, approach is None or approach.order is not order
-        old = approach
+        left = round(order.by * PRIOR_FPS) - state.frames + 1
+        old, new = approach, approach is None or approach.order is not order
         if approach is None or new:
-            refusal = _refuse(state, order)
+            refusal = _refuse(state, order, left)
             before = approach.held if approach and refusal else plain
             approach = Approach(order, before, refused=refusal is not None)
         # What is too far is walked first until little is left; what can be stitched as a whole is.
@@ -193,8 +171,7 @@ class Arriver:
                 after, frames, work = found
                 _proceed(work, began, seconds)
                 return after, frames
-            held, rest = begin_stitch(self.transitions, state, command, order, left, planned=planned)
-            approach = replace(approach, planned=held, rest=rest)
+            approach = self._begin_stitch(state, approach, command, order, left, planned)
         if approach.rest is not None and approach.planned is not None and not len(approach.planned):
             approach = replace(approach, planned=approach.rest.finish(), rest=None)
         if approach.planned is not None and len(approach.planned):
@@ -206,6 +183,20 @@ class Arriver:
         led = approach.held if there else _lead_to(state, plain, order, left)
         state, frames = step(replace(state, approach=approach), led, seconds=seconds)
         return state, replace(frames, refusal=refusal)
+
+    def _begin_stitch(
+        self, state: SteerState, approach: Approach, command: Command, order: Arrival, left: int, planned: Tensor
+    ) -> Approach:
+        """Begin the stitch to a target, so many frames away. Frames of the next step as they were `planned` before play
+        meanwhile; none where no time is left for the rest after them."""
+        held = planned[: state.settings.commit]
+        if left - len(held) < LEAST_FRAMES:
+            held = held[:0]
+        there = replace(state, committed=commit_frames(state, held)) if len(held) else state
+        if len(held) and needed_speed(there, order, left - len(held)) > state.prior.limits.max_steering_speed:
+            there, held = state, held[:0]
+        rest = plan_stitch(self.transitions, there, command, order, left - len(held))
+        return replace(approach, planned=held, rest=StepwiseWork(rest))
 
     def _set_out(
         self, state: SteerState, approach: Approach, command: Command, left: int
@@ -234,14 +225,9 @@ def _proceed(work: StepwiseWork[Tensor], began: float, seconds: float | None) ->
         work.proceed(seconds - (time.perf_counter() - began))
 
 
-def _arrival_frame(order: Arrival) -> int:
-    return round(order.by * PRIOR_FPS)
-
-
-def _refuse(state: SteerState, order: Arrival) -> Refusal | None:
-    """Return why an order cannot be met; None where it can."""
-    frames, scale = _arrival_frame(order) - state.frames + 1, state.character.scale
-    left, least = frames / PRIOR_FPS, LEAST_FRAMES / PRIOR_FPS
+def _refuse(state: SteerState, order: Arrival, frames: int) -> Refusal | None:
+    """Return why an order cannot be met in so many frames; None where it can."""
+    left, least, scale = frames / PRIOR_FPS, LEAST_FRAMES / PRIOR_FPS, state.character.scale
     if frames < LEAST_FRAMES:
         reason = f"an arrival in {left:.2f} s is not obeyed: the shortest takes {least:.2f} s"
         return Refusal(order, reason)
@@ -267,36 +253,14 @@ def _lead_to(state: SteerState, command: Command, order: Arrival, left: int) -> 
 
 def _deliver(state: SteerState, approach: Approach, command: Command) -> tuple[SteerState, SteerFrames]:
     """Deliver the next planned frames, and advance the density over them."""
-    planned, character, committed = approach.planned, state.character, state.committed
+    planned, start = approach.planned, state.committed.ground_pose
     assert planned is not None
     new, rest = planned[: state.settings.commit], planned[state.settings.commit :]
-    unit = decode(new, committed.ground_pose, skeleton=character.unit_skeleton)
-    after = commit_frames(state, new)
-    ahead = decode(rest, after.ground_pose, skeleton=character.unit_skeleton).joint_positions() if len(rest) else None
-    forecast = unit.joint_positions()[:0] if ahead is None else ahead
-    motion = character.motion(unit)
-    overlay, motion = state.overlay.pose(motion, command, forecast * character.scale)
-    targets = _read_targets(new, committed.ground_pose, state.target)
-    velocities = torch.tensor([target.velocity for target in targets])
-    frames = SteerFrames(
-        motion,
-        Status(Outcome.DONE),
-        Ledger(),
-        features=new,
-        contacts=LAYOUT.pick(new, "contacts"),
-        steering_targets=tuple(map(character.target, targets)),
-        forecast=forecast * character.scale,
-    )
-    next_state = replace(
-        state,
-        committed=after,
-        target=targets[-1],
-        past_targets=torch.cat([state.past_targets, velocities])[-_PAST_FRAMES:],
-        frames=state.frames + len(new),
-        overlay=overlay,
-        approach=replace(approach, planned=rest),
-    )
-    return next_state, frames
+    after, forecast = commit_frames(state, new), None
+    if len(rest):
+        forecast = decode(rest, after.ground_pose, skeleton=state.character.unit_skeleton).joint_positions()
+    state, frames = deliver(state, after, new, _read_targets(new, start, state.target), command, forecast)
+    return replace(state, approach=replace(approach, planned=rest)), frames
 
 
 def _read_targets(features: Tensor, start: GroundPose, before: SteeringTarget) -> list[SteeringTarget]:

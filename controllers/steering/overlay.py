@@ -125,8 +125,7 @@ def _is_in_reach(
     *,
     keep: bool,
 ) -> bool:
-    """Return whether a hand gets to a position from a pose, with a lean of the trunk; one already moving a little
-    farther."""
+    """Return whether a hand gets to a position with a lean of the trunk; one that is to `keep`, a little farther."""
     limb = LIMBS[name]
     away = joints.new_tensor(position) - joints[limb.upper]
     near = float(away.norm()) < limb.length(skeleton) + _NEAR + _LET_GO * keep

@@ -133,18 +133,14 @@ class Autopilot:
         if self._pursuit is None:
             return self._command
         pursued, left = self._pursuit.at(seconds), self._pursuit.left
-        if left is not None:
-            # The highest speed from which braking stops in time: v^2 = 2 a s.
-            speed = min(pursued.speed, math.sqrt(2 * self._limits.braking * max(0.0, left - _ARRIVAL_DISTANCE)))
-            if left <= _ARRIVAL_DISTANCE:
-                self.command(
-                    replace(
-                        self._command, speed=0.0, heading=pursued.heading, facing=None, turning=None, step_length=None
-                    )
-                )
-                return self._command
-            pursued = Command(speed, pursued.heading)
-        return replace(self._command, speed=pursued.speed, heading=pursued.heading, facing=None, turning=None)
+        led = replace(self._command, speed=pursued.speed, heading=pursued.heading, facing=None, turning=None)
+        if left is None:
+            return led
+        if left <= _ARRIVAL_DISTANCE:
+            self.command(replace(led, speed=0.0, step_length=None))
+            return self._command
+        # The highest speed from which braking stops in time: v^2 = 2 a s.
+        return replace(led, speed=min(led.speed, math.sqrt(2 * self._limits.braking * (left - _ARRIVAL_DISTANCE))))
 
 
 _WARM_UP_STEPS = 3  # steps before the clock starts, which compile and load what is needed
@@ -212,7 +208,18 @@ class ProcessClock(WallClock):
             self._notes.append(frames.refusal.reason)
         at = self._began + due + self._behind
         spare = at - time.perf_counter() - self._held
-        chunk = _to_frame_chunk(frames, due, at=at, spare=spare, notes=tuple(self._notes))
+        chunk = FrameChunk(
+            at,
+            due,
+            frames.motion.root_position.numpy(),
+            frames.motion.local_quat_xyzw.numpy(),
+            frames.contacts.numpy(),
+            frames.forecast.numpy(),
+            frames.steering_targets[-1].velocity,
+            spare,
+            frames.seconds,
+            tuple(self._notes),
+        )
         self._connection.send(("frames", chunk))
         self._held = 0.0
         self._notes.clear()
@@ -222,12 +229,6 @@ class ProcessClock(WallClock):
         self.restart = False
         self._began = find_second_zero(self, state)
         self.show(frames, 0.0)
-
-    def _pause(self, paused: bool) -> None:
-        now = time.perf_counter()
-        if self._paused_at is not None:
-            self._behind += now - self._paused_at
-        self._paused_at = now if paused else None
 
     def _handle_order(self) -> None:
         try:
@@ -245,7 +246,10 @@ class ProcessClock(WallClock):
         if word == "reset":
             self.restart = True
         elif word == "pause":
-            self._pause(*content)
+            (paused,), now = content, time.perf_counter()
+            if self._paused_at is not None:
+                self._behind += now - self._paused_at
+            self._paused_at = now if paused else None
         elif word == "aim":
             self._pilot.aim(*content)
         elif word == "go":
@@ -290,7 +294,10 @@ def _run_character(connection: Connection, request: CharacterRequest) -> None:
             prior, first, generator=generator, at=request.at, settings=request.settings, skeleton=request.skeleton
         )
         if number == 0:
-            _warm_up(state, first, transitions)
+            for _ in range(_WARM_UP_STEPS):
+                steer.step(state, first)
+            if transitions is not None:
+                Arriver(transitions)(state, replace(first, arrival=Arrival((0.0, 0.0), 1.0)))
             connection.send(("ready", None))
         _wait_for_turn(request.settings.commit / PRIOR_FPS)
         clock.begin(state, pose)
@@ -306,30 +313,6 @@ def _wait_for_turn(seconds: float) -> None:
     would search at the same time and then rest at the same time, and the last would have hardly any time to spare."""
     turn = os.getpid() * _TURN % 1
     time.sleep(seconds * ((turn - time.perf_counter() / seconds) % 1))
-
-
-def _warm_up(state: steer.SteerState, first: Command, transitions: Any | None) -> None:
-    for _ in range(_WARM_UP_STEPS):
-        steer.step(state, first)
-    if transitions is not None:
-        Arriver(transitions)(state, replace(first, arrival=Arrival((0.0, 0.0), 1.0)))
-
-
-def _to_frame_chunk(
-    frames: SteerFrames, seconds: float, *, at: float, spare: float, notes: tuple[str, ...]
-) -> FrameChunk:
-    return FrameChunk(
-        at,
-        seconds,
-        frames.motion.root_position.numpy(),
-        frames.motion.local_quat_xyzw.numpy(),
-        frames.contacts.numpy(),
-        frames.forecast.numpy(),
-        frames.steering_targets[-1].velocity,
-        spare,
-        frames.seconds,
-        notes,
-    )
 
 
 _READY_SECONDS = 120.0

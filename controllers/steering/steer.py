@@ -77,7 +77,10 @@ KEPT_FRAMES = 11
 _PAST_TARGET_FRAMES = 60  # past targets that are kept: more than the root velocity term looks back on
 _RECENT_FRAMES = 15  # frames, half a second, over which the velocity error is measured
 _MIN_TRAVEL_SPEED = 0.3  # m/s below which the velocity has no direction
-_FAR_TURN = math.radians(75)  # beyond which a start may turn faster than the limits
+_SIGMA_LEAVING = (
+    0.1  # radians, of the hips' heading in a start, which finds its first step sooner where they turn first
+)
+_FAR_TURN, _LEAVING_TURN = math.radians(75), 1.6  # beyond which a start may turn faster than the limits, and how much
 _NEAREST_STARTS = 6  # initial states nearest to the requested speed, of which one is sampled
 _RISE, _FALL = 0.1, 0.4  # share of the last step in what is expected: another process makes steps longer, none shorter
 _FORGET = 0.9  # of an evaluation's time after a step that had none to make: else there would never be one again
@@ -113,11 +116,6 @@ class SteerSettings:
     standing: float = 0.25
     """Mean speed over the last half second, m/s, below which a character whose target ahead is faster than it by more
     than `stuck` is solved that way at once: it would count as stuck half a second later."""
-    sigma_leaving: float = 0.1
-    """Sigma of the hips' heading in such steps, radians, where it is smaller than `sigma_facing`: a start that needs a
-    turn finds its first step sooner where the body turns first."""
-    leaving_turn: float = 1.6
-    """Factor of the turn rate of `limits` at which the target of a standing character may turn far aside."""
     random_starts: int = 12
     """Random warm starts of that solve, evaluated in one batch beside the evaluations; it begins at the best."""
     footing: FootContact = field(default_factory=FootContact)
@@ -252,7 +250,7 @@ def begin(
     chosen = settings or SteerSettings()
     character = Character(skeleton, chosen.footing.rest_height)
     command = character.command(command)
-    starts = (condition_prior(prior, command.labels) if command.labels else prior).initial_states
+    starts = condition_prior(prior, command.labels).initial_states
     nearest = (starts.speed - command.speed).abs().argsort()[:_NEAREST_STARTS]
     pick = int(nearest[torch.randint(len(nearest), (1,), generator=generator)])
     state = starts.state.pick(torch.tensor([pick]))
@@ -282,8 +280,7 @@ def accept(prior: Density, command: Command) -> tuple[Command, list[str]]:
 
     RequestError for labels that the prior does not know.
     """
-    if command.labels:
-        condition_prior(prior, command.labels)
+    condition_prior(prior, command.labels)
     return command.within(prior.limits.max_steering_speed)
 
 
@@ -300,9 +297,9 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
     if stuck:
         state = _restart_target(state)
     targets, leaving = _plan_targets(state, command)
-    conditioned = replace(state, prior=condition_prior(state.prior, command.labels)) if command.labels else state
+    conditioned = replace(state, prior=condition_prior(state.prior, command.labels))
     free = stuck or leaving
-    sigma_facing = min(settings.sigma_facing, settings.sigma_leaving) if free else settings.sigma_facing
+    sigma_facing = min(settings.sigma_facing, _SIGMA_LEAVING) if free else settings.sigma_facing
     terms = (*_build_steering_terms(state, targets, command.step_length, sigma_facing), *state.terms)
     if asked.obstacles:
         terms = (*terms, character.term(KeepClear(asked.obstacles)))
@@ -312,36 +309,50 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
         cold = replace(state.committed, warm_start=state.committed.warm_start[:0], forecast=None)
         restarted = replace(conditioned, committed=cold)
         done, _ = _solve_step(restarted, terms, 0.0, free=False)  # the prior's own continuation, which always exists
-    new = done.features[-settings.commit :]
-    forecast = (done.forecast if done.forecast is not None else done.joints_world[:0]) * character.scale
-    motion = character.motion(decode(new, state.committed.ground_pose, skeleton=character.unit_skeleton))
-    overlay, motion = state.overlay.pose(motion, asked, forecast)
-    record, committed_targets = done.windows[-1], tuple(targets[: settings.commit])
+    new, record = done.features[-settings.commit :], done.windows[-1]
     cut_short = record.outcome == LbfgsStatus.OUT_OF_BUDGET.value and record.evaluations < settings.evaluations
     note = f"the deadline came after {record.evaluations} of {settings.evaluations} evaluations"
     status = Status(Outcome.BUDGET, (note,)) if cut_short else Status(Outcome.DONE)
+    committed, forecast = done.discard_history(max(len(new), KEPT_FRAMES)), done.forecast
+    after, frames = deliver(state, committed, new, targets[: settings.commit], asked, forecast)
     ledger, spent = character.ledger(done.ledger), time.perf_counter() - began
+    cost = state.cost.learn(spent, record.evaluations, search=search, cut_short=cut_short)
+    return replace(after, cost=cost), replace(
+        frames, status=status, ledger=ledger, windows=done.windows, seconds=spent, evaluations=record.evaluations
+    )
+
+
+def deliver(
+    state: SteerState,
+    committed: CommittedFrames,
+    new: Float[Tensor, "frames size"],
+    targets: Sequence[SteeringTarget],
+    command: Command,
+    forecast: Float[Tensor, "ahead joints 3"] | None,
+) -> tuple[SteerState, SteerFrames]:
+    """Return the state after new frames, with what is committed then and their targets, and the frames as they are
+    shown, with the forecast of those after them, all at the prior's size."""
+    character = state.character
+    ahead = (committed.joints_world[:0] if forecast is None else forecast) * character.scale
+    motion = character.motion(decode(new, state.committed.ground_pose, skeleton=character.unit_skeleton))
+    overlay, motion = state.overlay.pose(motion, command, ahead)
     frames = SteerFrames(
         motion,
-        status,
-        ledger,
-        done.windows,
-        new,
-        spent,
+        Status(Outcome.DONE),
+        Ledger(),
+        features=new,
         contacts=LAYOUT.pick(new, "contacts"),
-        steering_targets=tuple(character.target(target) for target in committed_targets),
-        forecast=forecast,
-        evaluations=record.evaluations,
+        steering_targets=tuple(map(character.target, targets)),
+        forecast=ahead,
     )
-    velocities = torch.tensor([target.velocity for target in committed_targets])
+    velocities = torch.tensor([target.velocity for target in targets])
     next_state = replace(
         state,
-        committed=done.discard_history(max(len(new), KEPT_FRAMES)),
-        target=committed_targets[-1],
+        committed=committed,
+        target=targets[-1],
         past_targets=torch.cat([state.past_targets, velocities])[-_PAST_TARGET_FRAMES:],
         frames=state.frames + len(new),
         overlay=overlay,
-        cost=state.cost.learn(time.perf_counter() - began, record.evaluations, search=search, cut_short=cut_short),
     )
     return next_state, frames
 
@@ -353,13 +364,13 @@ def _lead_around(state: SteerState, command: Command) -> Command:
     x, _, z = (state.committed.joints_world[-1, 0] * state.character.scale).tolist()
     heading = state.target.heading if state.target.speed > 0 else float(state.committed.ground_pose.heading)
     led = lead_around(command.obstacles, position=(x, z), heading=heading, wanted=command.heading, speed=command.speed)
-    return command if led == command.heading else replace(command, heading=led)
+    return replace(command, heading=led)
 
 
 @lru_cache(maxsize=64)
 def condition_prior(prior: Density, labels: tuple[str, ...]) -> Density:
-    """Condition the prior on labels; cached, since it takes as long as a step may last."""
-    return prior.conditioned_on(labels)
+    """Condition the prior on labels, if there are any; cached, since it takes as long as a step may last."""
+    return prior.conditioned_on(labels) if labels else prior
 
 
 def _solve_step(
@@ -394,21 +405,15 @@ def _velocity_error(state: SteerState) -> float:
 
 def _plan_targets(state: SteerState, command: Command) -> tuple[list[SteeringTarget], bool]:
     """Return the targets of a window, and whether a standing character is to go; it may turn faster."""
-    settings, target = state.settings, state.target
+    settings, target, leaving = state.settings, state.target, False
     targets = target.ahead(command, settings.limits, frames=settings.horizon, fps=PRIOR_FPS)
-    leaving = _is_leaving(state, targets)
+    if len(state.committed.joints_world) > _RECENT_FRAMES:
+        speed = float(_recent_velocity(state).norm())
+        leaving = speed < settings.standing and targets[-1].speed > speed + settings.stuck
     if leaving and abs(math.remainder(command.heading - target.heading, 2 * math.pi)) > _FAR_TURN:
-        limits = replace(settings.limits, turn_rate=settings.leaving_turn * settings.limits.turn_rate)
+        limits = replace(settings.limits, turn_rate=_LEAVING_TURN * settings.limits.turn_rate)
         targets = target.ahead(command, limits, frames=settings.horizon, fps=PRIOR_FPS)
     return targets, leaving
-
-
-def _is_leaving(state: SteerState, targets: Sequence[SteeringTarget]) -> bool:
-    """Return whether a standing character is to go."""
-    if len(state.committed.joints_world) <= _RECENT_FRAMES:
-        return False
-    speed = float(_recent_velocity(state).norm())
-    return speed < state.settings.standing and targets[-1].speed > speed + state.settings.stuck
 
 
 def _recent_velocity(state: SteerState) -> Float[Tensor, "2"]:
@@ -418,10 +423,8 @@ def _recent_velocity(state: SteerState) -> Float[Tensor, "2"]:
 
 
 def _restart_target(state: SteerState) -> SteerState:
-    """Restart the steering target from the character's velocity and facing, without past targets.
-
-    A target far ahead of a stuck character (a walk to its side while it stands) guides no search.
-    """
+    """Restart the steering target from the character's velocity and facing, without past targets. A target far ahead of
+    a stuck character (a walk to its side while it stands) guides no search."""
     velocity, facing = _recent_velocity(state), float(state.committed.ground_pose.heading)
     speed = float(velocity.norm())
     heading = math.atan2(*velocity.tolist()) if speed > _MIN_TRAVEL_SPEED else facing
@@ -449,11 +452,9 @@ def _relax_footing_first(
     half: LatentNoiseSolver, samples: int, terms: Sequence[Term], footing: FootContact
 ) -> SingleWindowSolver:
     """Build a window solver that spends half on all terms but contacts, from the best of some samples, and half on all
-    terms, each with half of the time.
-
-    A standing character has both feet planted, by contacts that are fixed while a window is solved: the contact term
-    then prevents any step. The search without it finds one, along which the prior predicts new contacts.
-    """
+    terms, each with half of the time. A standing character has both feet planted, by contacts that are fixed while a
+    window is solved: the contact term then prevents any step. The search without it finds one, along which the prior
+    predicts new contacts."""
     space = SteeringKnots(_KNOTS, tuple(LAYOUT.slices)[:-1], _KNOT_SIGMA)
     budget = replace(half.budget, evaluations=samples + (half.budget.evaluations or 1))
     relaxed = replace(half, proposal=BestOfSamples(samples, space), budget=budget)

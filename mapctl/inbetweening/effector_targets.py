@@ -13,7 +13,7 @@ from mapctl.kinematics import inverse
 from mapctl.motion import Motion
 from mapctl.numerics import smooth_offsets
 from mapctl.numerics.intervals import fill_missing, fill_missing_angle
-from mapctl.skeleton import CANONICAL, LIMBS, TOE_REST_HEIGHT, Skeleton, leg_length
+from mapctl.skeleton import CANONICAL, LIMBS, TOE_REST_HEIGHT, Limb, Skeleton, leg_length
 
 _MIN_REACH_SECONDS = 0.15  # seconds over which a limb goes to its target and back, at least
 _REACH_ACCELERATION = 15.0  # m/s^2 at which it goes farther
@@ -31,15 +31,10 @@ class EffectorTargets:
 
     def shown(self, seconds: Float[Tensor, " shown"], *, fps: float) -> "EffectorTargets":
         """Return the targets at other, increasing times: each is moved to the time nearest to its own."""
-        nearest = _find_nearest_times(len(self.positions), seconds, fps=fps)
-        joints = self.positions.shape[1]
-        positions, wanted = (
-            self.positions.new_zeros(len(seconds), joints, 3),
-            self.wanted.new_zeros(len(seconds), joints),
-        )
-        for frame, joint in self.wanted.nonzero().tolist():
-            positions[nearest[frame], joint] = self.positions[frame, joint]
-            wanted[nearest[frame], joint] = True
+        frame, joint = self.wanted.nonzero(as_tuple=True)
+        nearest = _find_nearest_times(len(self.positions), seconds, fps=fps)[frame]
+        positions, wanted = (values.new_zeros(len(seconds), *values.shape[1:]) for values in vars(self).values())
+        positions[nearest, joint], wanted[nearest, joint] = self.positions[frame, joint], True
         return EffectorTargets(positions, wanted)
 
 
@@ -66,19 +61,24 @@ def reach_effector_targets(motion: Motion, targets: EffectorTargets, free: Bool[
         wanted = targets.wanted[:, limb.end] & free
         if not bool(wanted.any()):
             continue
-        positions = motion.joint_positions().clone()
-        errors = torch.where(wanted[:, None], targets.positions[:, limb.end] - positions[:, limb.end], 0.0)
+        ends = motion.joint_positions()[:, limb.end]
+        errors = torch.where(wanted[:, None], targets.positions[:, limb.end] - ends, 0.0)
         seconds = max(_MIN_REACH_SECONDS, math.sqrt(float(errors.norm(dim=-1).max()) / _REACH_ACCELERATION))
         offset = smooth_offsets.interpolate_offsets(errors, wanted | ~free, seconds=seconds, fps=float(motion.fps))
         offset = torch.where(free[:, None], offset, 0.0)
-        positions[:, limb.end] += offset
-        turning = torch.zeros(positions.shape[:2], dtype=torch.bool)
-        turning[:, [limb.upper, limb.lower]] = (offset.norm(dim=-1) > _NEGLIGIBLE)[:, None]
-        quats = inverse.solve_inverse_kinematics(
-            positions, motion.local_quat_xyzw, motion.skeleton, free=turning, limbs=(limb,)
-        )
-        motion = replace(motion, local_quat_xyzw=torch.where(turning[..., None], quats, motion.local_quat_xyzw))
+        motion = bend_limb(motion, limb, ends + offset, offset.norm(dim=-1) > _NEGLIGIBLE)
     return motion
+
+
+def bend_limb(motion: Motion, limb: Limb, ends: Float[Tensor, "frames 3"], frames: Bool[Tensor, " frames"]) -> Motion:
+    """Bend a limb of a canonical motion in some frames so that its end is at `ends` (world, metres), as far as it
+    reaches."""
+    goals, free = motion.joint_positions().clone(), torch.zeros(motion.num_frames, motion.num_joints, dtype=torch.bool)
+    goals[:, limb.end] = torch.where(frames[:, None], ends, goals[:, limb.end])
+    free[:, [limb.upper, limb.lower]] = frames[:, None]
+    quats, root = motion.local_quat_xyzw, motion.root_position
+    bent = inverse.solve_inverse_kinematics(goals, quats, motion.skeleton, free=free, limbs=(limb,), root_position=root)
+    return replace(motion, local_quat_xyzw=torch.where(free[..., None], bent, quats))
 
 
 _ANKLE_REST_HEIGHT = 0.1174
@@ -152,10 +152,7 @@ class LooseKeys:
             cosine = math.cos(float(self.view[frame]) - view)
             # From elsewhere only heights look the same.
             flat = abs(cosine) > math.cos(_SAME_VIEW)
-            positions[frame, drawn, 0], positions[frame, drawn, 1] = (
-                math.copysign(1.0, cosine) * sketch[:, 0],
-                sketch[:, 1],
-            )
+            positions[frame, drawn, :2] = sketch.new_tensor([math.copysign(1.0, cosine), 1.0]) * sketch
             axes[frame, drawn, 0], axes[frame, drawn, 1] = flat, True
         return SeenDrawings(positions, axes, view)
 

@@ -1,68 +1,22 @@
 """Missing values of a motion on any rig, and their interpolation: by cubics that leave and arrive at the velocities
-beside a gap, as far as velocities last that long.
-"""
+beside a gap, as far as velocities last that long."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from mapctl import rotations
-from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import fill_missing, last_observed, next_observed
-from mapctl.recording.masks import Mask, expand_masks
-from mapctl.retarget import RigMap
-from mapctl.skeleton import CANONICAL
+from mapctl.numerics.smooth_offsets import blend_seams_in_positions, blend_seams_in_rotations
+from mapctl.recording.masks import MissingMask
 
 _VELOCITY_SECONDS = 0.6  # seconds over which half of a velocity is lost
-
-
-@dataclass(frozen=True, eq=False)
-class MissingMask:
-    """Mask of the missing values of a motion."""
-
-    joints: Bool[Tensor, "frames joints"]
-    """Whether a joint's rotation is missing, by joint of the rig."""
-    root: Bool[Tensor, " frames"]
-    """Whether the body's position is missing."""
-
-    @staticmethod
-    def of_masks(motion: Motion, masks: Sequence[Mask], rigmap: RigMap, *, keep_position: bool = True) -> "MissingMask":
-        """Build the mask from masks by joint. Where a joint is missing so is its parent's rotation, unless the parent
-        has other children that show it. RequestError for joints and frames that the motion has not, and where nothing
-        of it is left: no joint, or no position of the body unless that may be so."""
-        for mask in masks:
-            if mask.stop > motion.num_frames:
-                raise RequestError(
-                    f"the gap {mask.start}:{mask.stop} ends after the motion's {motion.num_frames} frames"
-                )
-        joints, root = expand_masks(motion, masks)
-        joints = joints.clone()
-        for child, parent in enumerate(CANONICAL.parents):
-            own, above = rigmap.joint_of[child], rigmap.joint_of[parent] if parent >= 0 else None
-            if own is not None and above is not None and len(CANONICAL.children(parent)) == 1:
-                joints[:, above] |= joints[:, own]
-        if (keep_position and root.all()) or bool(joints.all()):
-            raise RequestError(f"the gaps leave nothing of the motion's {motion.num_frames} frames to go by")
-        return MissingMask(joints, root)
-
-    @staticmethod
-    def of_frames(missing: Bool[Tensor, " frames"], joints: int) -> "MissingMask":
-        """Build the mask of whole frames of a motion with so many joints."""
-        return MissingMask(missing[:, None].expand(-1, joints).clone(), missing)
-
-    @property
-    def frames(self) -> Bool[Tensor, " frames"]:
-        """Frames in which anything is missing."""
-        return self.root | self.joints.any(dim=1)
-
-    def slice(self, start: int, stop: int) -> "MissingMask":
-        """Return frames start to stop."""
-        return MissingMask(self.joints[start:stop], self.root[start:stop])
 
 
 def interpolate_missing(motion: Motion, missing: MissingMask) -> Motion:
@@ -76,9 +30,7 @@ def interpolate_missing(motion: Motion, missing: MissingMask) -> Motion:
     gap = _Gaps(frame, before[frame, joint], after[frame, joint], motion.num_frames)
 
     def turn(first: Int[Tensor, " values"], last: Int[Tensor, " values"]) -> Float[Tensor, "values 3"]:
-        return rotations.to_rotation_vector(
-            rotations.multiply(rotations.inverse(quats[first, joint]), quats[last, joint])
-        )
+        return rotations.turns_between(quats[first, joint], quats[last, joint])
 
     between = rotations.slerp(quats[gap.before, joint], quats[gap.after, joint], gap.share.to(quats))
     bend = rotations.from_rotation_vector(_carry_velocities(gap, turn, lambda at: known[joint, at], fps=fps))
@@ -94,17 +46,15 @@ def interpolate_missing(motion: Motion, missing: MissingMask) -> Motion:
     )
 
 
-def restore_observed(motion: Motion, original: Motion, missing: MissingMask) -> Motion:
-    """Return the original with its missing values from `motion`, of the same rig and length; all else to the bit."""
-    moving = {
-        joint: torch.where(missing.root[:, None], motion.moving_offsets[joint], values)
-        for joint, values in original.moving_offsets.items()
-    }
+def blend_seams(motion: Motion, missing: MissingMask) -> Motion:
+    """Blend the seams of values that were missing and are filled in; all others stay."""
+    fps = float(motion.fps)
+    blend = partial(blend_seams_in_positions, new=missing.root, fps=fps)
     return replace(
-        original,
-        moving_offsets=moving,
-        root_position=torch.where(missing.root[:, None], motion.root_position, original.root_position),
-        local_quat_xyzw=torch.where(missing.joints[..., None], motion.local_quat_xyzw, original.local_quat_xyzw),
+        motion,
+        root_position=blend(motion.root_position),
+        moving_offsets={joint: blend(values) for joint, values in motion.moving_offsets.items()},
+        local_quat_xyzw=blend_seams_in_rotations(motion.local_quat_xyzw, missing.joints, fps=fps),
     )
 
 
@@ -136,8 +86,7 @@ def _carry_velocities(
     fps: float,
 ) -> Float[Tensor, "values width"]:
     """Compute what a cubic Hermite spline adds to straight lines: the velocities of the 1/30 s beside a gap, where they
-    are known on one side with no acceleration at the other end; as far as they last.
-    """
+    are known on one side with no acceleration at the other end; as far as they last."""
     length, share, steps = gap.length[:, None], gap.share[:, None], max(1, round(fps / float(PRIOR_FPS)))
     straight = displacement(gap.before, gap.after) / length
     enclosed = (gap.before < gap.frame) & (gap.frame < gap.after)

@@ -113,16 +113,9 @@ class PartialMotion:
 
     def slice(self, start: int, stop: int) -> "PartialMotion":
         """Return frames start to stop."""
-        part, known = slice(start, stop), self.known
-        return PartialMotion(
-            self.root_position[:, part],
-            self.heading[:, part],
-            self.quats[:, part],
-            self.contacts[:, part],
-            self.targets[:, part],
-            self.offsets,
-            KnownParts(**{name: values[:, part] for name, values in vars(known).items()}),
-        )
+        by_frame = ("root_position", "heading", "quats", "contacts", "targets")
+        known = KnownParts(**{name: values[:, start:stop] for name, values in vars(self.known).items()})
+        return replace(self, known=known, **{name: getattr(self, name)[:, start:stop] for name in by_frame})
 
     def mirrored(self) -> "PartialMotion":
         """Exchange left and right."""
@@ -151,8 +144,7 @@ def interpolate_partial_motion(
     """Interpolate a motion where it is not known: rotations along the shortest arc from the last known frame to the
     next, positions and heading linearly; beyond the first and the last they are held. Unknown values may be anything
     finite, but a rough path is followed. What is known in no frame is the mean pose's, over the origin, facing +Z.
-    Unknown limbs then bend to their targets, from what they do half a second earlier and later.
-    """
+    Unknown limbs then bend to their targets, from what they do half a second earlier and later."""
     known, root = motion.known, motion.root_position
     shown = known.ground | known.path
     ground = _where_ever(shown, fill_missing(root[..., ::2], shown), 0.0)

@@ -1,6 +1,5 @@
 """Pairs of poses and their features for keyframe timing: distance in the world and by limb, rotation of the hips, and
-cues of the gait (step length, bent knees and arms, a leaning trunk), which distinguish a stroll from a run.
-"""
+cues of the gait (step length, bent knees and arms, a leaning trunk), which distinguish a stroll from a run."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -61,8 +60,7 @@ class TimingModel(Protocol):
         self, features: Float[Tensor, "pairs features"], metres: Float[Tensor, " pairs"]
     ) -> Float[Tensor, "pairs 3"]:
         """Estimate the 10th, 50th and 90th percentile of the time between the poses of pairs, seconds; `metres` is
-        their distance over the ground.
-        """
+        their distance over the ground."""
         ...
 
 
@@ -70,8 +68,7 @@ def sample_pose_pairs(
     bodies: Iterable[Motion], generator: torch.Generator, *, count: int, shortest: float, longest: float
 ) -> PosePairs:
     """Sample `count` pairs from every clip on canonical bones at the priors' rate that is long enough, their seconds
-    uniformly between the bounds and the clip's own length.
-    """
+    uniformly between the bounds and the clip's own length."""
     features, metres, seconds = [], [], []
     low = round(shortest * PRIOR_FPS)
     for body in bodies:
@@ -92,8 +89,7 @@ def compute_pair_features(
     body: Motion, first: Int[Tensor, " pairs"], second: Int[Tensor, " pairs"]
 ) -> Float[Tensor, "pairs features"]:
     """Compute the features of pairs of frames of a motion on canonical bones, in the order of `PAIR_FEATURES`: metres,
-    their logarithms, and radians.
-    """
+    their logarithms, and radians."""
     positions, facing = body.joint_positions(), heading(body.local_quat_xyzw[:, 0])
     own = _see_from_hips(positions, facing)
     metres = compute_travel_distance(body, first, second)

@@ -15,11 +15,11 @@ from torch import Tensor
 
 from mapctl import contacts, rotations
 from mapctl.features import PRIOR_FPS
+from mapctl.inbetweening.missing import blend_seams
 from mapctl.inbetweening.query import GapQuery, Proposal
 from mapctl.kinematics import heading, inverse
 from mapctl.numerics import gaussian
 from mapctl.numerics.intervals import last_observed, next_observed
-from mapctl.numerics.smooth_offsets import blend_seams_in_positions, blend_seams_in_rotations
 from mapctl.skeleton import CANONICAL, LIMBS, TOE_JOINTS
 
 _PARTNERS = CANONICAL.mirror_partners()
@@ -50,18 +50,16 @@ class PositionImage:
         *,
         known: Bool[Tensor, "batch frames joints"],
         present: Bool[Tensor, "batch frames"],
-        toes: tuple[int, int],
         known_axes: Bool[Tensor, "batch frames joints 3"] | None = None,
     ) -> "PositionImage":
         """Build an image from world positions (metres) and the hips' heading (radians), interpolated where they are not
-        known; the reference is their root, and `toes` are the indices of the left and the right one. Contacts of toes
-        that are not known may be anything finite. Where single coordinates are known they are given by `known_axes`,
-        beside the joints that are `known` whole."""
+        known; the reference is their root. Contacts of toes that are not known may be anything finite. Where single
+        coordinates are known they are given by `known_axes`, beside the joints that are `known` whole."""
         known = known & present[..., None]
         axes = known[..., None].expand(*known.shape, 3)
         if known_axes is not None:
             axes = axes | (known_axes & present[..., None, None])
-        bits = torch.where(known[..., list(toes)], contacts, 0.5)
+        bits = torch.where(known[..., list(TOE_JOINTS)], contacts, 0.5)
         ground, facing = positions_world[..., 0, ::2], rotations.unwrap_angle(heading)
         image = PositionImage(positions_world, bits, axes, present, ground, facing)
         return replace(image, positions=image.from_world(positions_world))
@@ -109,8 +107,7 @@ class PositionImage:
 
     def copy_nearest(self) -> tuple[Float[Tensor, "batch frames joints 3"], Float[Tensor, "batch frames joints 3"]]:
         """Copy every coordinate from the nearest frame in which it is known, and return how many frames away that is:
-        the dense input of Zhou et al. 2020, section 3.5. Coordinates that are never known are 0, infinitely far.
-        """
+        the dense input of Zhou et al. 2020, section 3.5. Coordinates that are never known are 0, infinitely far."""
         known = self.known_axes.flatten(2).transpose(1, 2).flatten(0, 1)  # one row for each coordinate of each motion
         values = self.positions.flatten(2).transpose(1, 2).flatten(0, 1)
         frame = torch.arange(values.shape[1], device=values.device)
@@ -167,7 +164,6 @@ def propose_from_positions(
         planted.float()[None],
         known=query.known_positions[None],
         present=torch.ones(1, len(positions), dtype=torch.bool),
-        toes=TOE_JOINTS,
     )
     answer = complete(image)
     wanted = image.to_world(_remove_jitter(answer.positions, image))[0].double()
@@ -183,9 +179,7 @@ def propose_from_positions(
         wanted, shown.local_quat_xyzw, CANONICAL, free=missing.joints, root_position=root, limbs=limbs
     )
     quats = torch.where(missing.joints[..., None], quats, shown.local_quat_xyzw)
-    quats = blend_seams_in_rotations(quats, missing.joints, fps=PRIOR_FPS)
-    root = blend_seams_in_positions(root * query.scale, missing.root, fps=PRIOR_FPS)
-    motion = replace(shown, root_position=root, local_quat_xyzw=quats)
+    motion = blend_seams(replace(shown, root_position=root * query.scale, local_quat_xyzw=quats), missing)
     toes = motion.joint_positions()[:, list(TOE_JOINTS)][..., ::2]
     speeds = torch.diff(toes, dim=0, prepend=toes[:1]).norm(dim=-1) * float(motion.fps)
     slow = speeds < _MIN_SWING_SPEED * query.scale
@@ -196,8 +190,7 @@ def propose_from_positions(
 
 def _remove_jitter(positions: Float[Tensor, "1 frames joints 3"], image: PositionImage) -> Tensor:
     """Smooth a network's changes over about a frame, since the errors of its frames are independent. Where the changes
-    are tiny they are jitter, and fade to the interpolation; known positions stay.
-    """
+    are tiny they are jitter, and fade to the interpolation; known positions stay."""
     change = (positions - image.positions)[0]
     smooth = gaussian.convolve(change, gaussian.kernel(_JITTER_SIGMA, 3), "repeated")
     power = gaussian.convolve(smooth.square().sum(dim=-1), gaussian.kernel(_POWER_SIGMA, 3 * _POWER_SIGMA), "repeated")

@@ -10,9 +10,9 @@ from torch import Tensor
 from mapctl import contacts, rotations
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.effector_targets import EffectorTargets, LooseKeys
-from mapctl.inbetweening.missing import MissingMask
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
+from mapctl.recording.masks import MissingMask, restore_observed
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, leg_length
 
 _MAX_ROOT_KEY_FRAMES = 5  # frames at PRIOR_FPS: hips that are known for longer, a network follows
@@ -40,12 +40,10 @@ class GapQuery:
 
     @property
     def known_positions(self) -> Bool[Tensor, "frames joints"]:
-        """Joints whose world position is known: the root position and all rotations above them are."""
-        known = [~self.missing.root]
-        for parent in CANONICAL.parents[1:]:
-            known.append(known[parent] & ~self.missing.joints[:, parent])
-        known[0] = ~(self.missing.root | self.missing.joints[:, 0])
-        return torch.stack(known, dim=1)
+        """Joints whose world position is known, and of the hips the rotation as well."""
+        known = self.missing.known_positions
+        known[:, 0] &= ~self.missing.joints[:, 0]
+        return known
 
     @property
     def nothing_known(self) -> Bool[Tensor, " frames"]:
@@ -131,15 +129,12 @@ class Proposal:
     def take(self, other: "Proposal", gaps: Sequence[tuple[int, int]]) -> "Proposal":
         """Return this proposal with the motion and contacts that another one has in some gaps, first frames and one
         past the last; the sources stay."""
-        root, quats = self.motion.root_position.clone(), self.motion.local_quat_xyzw.clone()
-        logits = self.contact_logits.clone()
+        taken, logits = torch.zeros(len(self.contact_logits), dtype=torch.bool), self.contact_logits
         for start, stop in gaps:
-            part = slice(start, stop)
-            root[part], quats[part] = other.motion.root_position[part], other.motion.local_quat_xyzw[part]
-            logits[part] = other.contact_logits[part].to(logits)
-        return replace(
-            self, motion=replace(self.motion, root_position=root, local_quat_xyzw=quats), contact_logits=logits
-        )
+            taken[start:stop] = True
+        motion = restore_observed(other.motion, self.motion, MissingMask.of_frames(taken, self.motion.num_joints))
+        logits = torch.where(taken[:, None], other.contact_logits.to(logits), logits)
+        return replace(self, motion=motion, contact_logits=logits)
 
     def lerp(self, other: "Proposal", weight: float, frames: slice) -> "Proposal":
         """Return this proposal with so much weight in some frames, and another one for the rest."""

@@ -30,20 +30,15 @@ class LocalMotion:
     """Joint positions from the hips in the hips' own heading frame, metres."""
     turns: Float[Tensor, "batch frames"]
     """Change of the heading since the frame before, radians; 0 in the first."""
-    present: Bool[Tensor, "batch frames"]
-    """Whether there is such a frame; others fill up a batch."""
 
     @staticmethod
     def of_world(
-        positions_world: Float[Tensor, "batch frames joints 3"],
-        heading: Float[Tensor, "batch frames"],
-        present: Bool[Tensor, "batch frames"] | None = None,
+        positions_world: Float[Tensor, "batch frames joints 3"], heading: Float[Tensor, "batch frames"]
     ) -> "LocalMotion":
         """Take out where the hips are (world, metres) and whither they face (radians)."""
-        present = torch.ones(heading.shape, dtype=torch.bool) if present is None else present
         relative = positions_world - positions_world[..., :1, :]
         turns = rotations.wrap_angle(torch.diff(heading, dim=-1, prepend=heading[..., :1]))
-        return LocalMotion(rotations.rotate_about_y(relative, -heading[..., None]), turns, present)
+        return LocalMotion(rotations.rotate_about_y(relative, -heading[..., None]), turns)
 
     def anchored_steps(self) -> Float[Tensor, "batch frames joints 3"]:
         """Return for every joint the step of the hips that would keep it in its place, in the heading frame of the
@@ -53,7 +48,7 @@ class LocalMotion:
 
     def mirrored(self) -> "LocalMotion":
         """Exchange left and right."""
-        return LocalMotion(mirror_positions(self.positions), -self.turns, self.present)
+        return LocalMotion(mirror_positions(self.positions), -self.turns)
 
 
 @dataclass(frozen=True, eq=False)

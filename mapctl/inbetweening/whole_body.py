@@ -7,15 +7,16 @@ bones.
 """
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import rotations
-from mapctl.inbetweening.effector_targets import EffectorTargets
-from mapctl.kinematics import forward_kinematics, inverse
+from mapctl.inbetweening.effector_targets import EffectorTargets, bend_limb
+from mapctl.kinematics import forward_kinematics
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, LIMBS
 
@@ -56,7 +57,7 @@ def reach_targets(
     shifts = torch.zeros_like(body.root_position)
     if not len(frames):
         return body, shifts
-    part = replace(body, root_position=body.root_position[frames], local_quat_xyzw=body.local_quat_xyzw[frames])
+    part = body.pick(frames)
     goals, wanted = targets.positions[frames], targets.wanted[frames]
     # Sigmas of shift (x, z), lean (x, y, z) and the rotations of the trunk; 0 for what may not move.
     step, lean = stray[frames].double()[:, None].expand(-1, 2), torch.full((len(frames), 3), _SIGMA_LEAN).double()
@@ -82,13 +83,16 @@ def _minimise_offsets(
 ) -> Float[Tensor, "poses offsets"]:
     """Find the mode of  |x / sigma|^2 + |r(x)|^2,  r the reach and balance residual; Levenberg-Marquardt in its small
     dual form, pose by pose: steps that do not help are damped more."""
-    ask = _ReachResidual.of(part, goals, wanted)
+    residual = _build_residual(part, goals, wanted.to(goals))
     unit, damping = torch.zeros_like(sigma), sigma.new_full((len(sigma), 1, 1), _DAMPING)
-    now = ask.residual(unit * sigma)
+    now = residual(unit * sigma)
     cost = unit.square().sum(1) + now.square().sum(1)
     identity = torch.eye(now.shape[1], dtype=now.dtype)
+    nearby = _DIFFERENCE_STEP * torch.eye(unit.shape[1], dtype=unit.dtype)[:, None]
     for _ in range(_MAX_STEPS):
-        jacobian = ask.jacobian(unit * sigma, now) * sigma[:, None]
+        # By differences, all in one batch: in double precision good to six digits.
+        shifted = residual((unit * sigma)[None] + nearby)
+        jacobian = ((shifted - now) / _DIFFERENCE_STEP).permute(1, 2, 0) * sigma[:, None]
         # Woodbury: (1 + damping) I + J'J is inverted by way of the few residuals.
         gradient = unit + (jacobian.transpose(1, 2) @ now[..., None])[..., 0]
         firm = 1 + damping
@@ -96,7 +100,7 @@ def _minimise_offsets(
             firm * identity + jacobian @ jacobian.transpose(1, 2), jacobian @ gradient[..., None]
         )
         step = -(gradient - (jacobian.transpose(1, 2) @ inner)[..., 0]) / firm[..., 0]
-        tried = ask.residual((unit + step) * sigma)
+        tried = residual((unit + step) * sigma)
         tried_cost = (unit + step).square().sum(1) + tried.square().sum(1)
         better = tried_cost < cost
         unit, now = torch.where(better[:, None], unit + step, unit), torch.where(better[:, None], tried, now)
@@ -107,45 +111,29 @@ def _minimise_offsets(
     return unit * sigma
 
 
-@dataclass(frozen=True, eq=False)
-class _ReachResidual:
-    """Residuals of poses: reach of limbs to their targets and of legs to the ground, and balance over the feet."""
+def _build_residual(
+    part: Motion, goals: Float[Tensor, "poses limbs 3"], wanted: Float[Tensor, "poses limbs"]
+) -> Callable[[Tensor], Tensor]:
+    """Build the residuals of poses by their offsets: by limb how much its target is too far and too near, then the
+    offset of the centre of mass (x, z)."""
+    skeleton, before = part.skeleton, part.joint_positions()
+    lengths = skeleton.offsets.new_tensor([limb.length(skeleton) for limb in LIMBS.values()])
+    limit, counts = _STRETCH_LIMIT * lengths, torch.maximum(wanted, _IS_FOOT)
+    # A leg that was stretched before may stay so.
+    was = (before[:, _ENDS] - before[:, _UPPER]).norm(dim=-1)
+    allowed = (1 - wanted) * _soft_excess(was - limit)
 
-    part: Motion
-    before: Float[Tensor, "poses joints 3"]
-    """World positions of the poses' joints, metres."""
-    goals: Float[Tensor, "poses limbs 3"]
-    wanted: Float[Tensor, "poses limbs"]
-    lengths: Float[Tensor, " limbs"]
-    """Metres."""
-
-    @staticmethod
-    def of(part: Motion, goals: Tensor, wanted: Tensor) -> "_ReachResidual":
-        lengths = part.skeleton.offsets.new_tensor([limb.length(part.skeleton) for limb in LIMBS.values()])
-        return _ReachResidual(part, part.joint_positions(), goals, wanted.to(goals), lengths)
-
-    def jacobian(
-        self, x: Float[Tensor, "poses offsets"], now: Float[Tensor, "poses residuals"]
-    ) -> Float[Tensor, "poses residuals offsets"]:
-        """Return the Jacobian by differences, all in one batch: in double precision good to six digits."""
-        shifted = x[None] + _DIFFERENCE_STEP * torch.eye(x.shape[1], dtype=x.dtype)[:, None]
-        return ((self.residual(shifted) - now) / _DIFFERENCE_STEP).permute(1, 2, 0)
-
-    def residual(self, x: Float[Tensor, "*more poses offsets"]) -> Float[Tensor, "*more poses residuals"]:
-        """Return by limb how much its target is too far and too near, then the offset of the centre of mass (x, z)."""
-        root, quats, shift = _apply_offsets(x, self.part.root_position, self.part.local_quat_xyzw)
-        skeleton = self.part.skeleton
+    def residual(x: Float[Tensor, "*more poses offsets"]) -> Float[Tensor, "*more poses residuals"]:
+        root, quats, shift = _apply_offsets(x, part.root_position, part.local_quat_xyzw)
         positions = forward_kinematics(skeleton.offsets.to(root), skeleton.parents, root, quats)[0]
-        goals = torch.where(self.wanted[..., None] > 0, self.goals, self.before[:, _ENDS] + shift[..., None, :])
-        far = (goals - positions[..., _UPPER, :]).norm(dim=-1)
-        was = (self.before[:, _ENDS] - self.before[:, _UPPER]).norm(dim=-1)
-        limit = _STRETCH_LIMIT * self.lengths
-        # A leg that was stretched before may stay so.
-        over = _soft_excess(far - limit) - (1 - self.wanted) * _soft_excess(was - limit)
-        counts = torch.maximum(self.wanted, _IS_FOOT)
-        near = counts * self.wanted * _soft_excess(_FOLD_LIMIT * self.lengths - far)
-        weight = ((positions - self.before)[..., _MASS_JOINTS, :] * _MASSES[:, None]).sum(dim=-2) - shift
+        there = torch.where(wanted[..., None] > 0, goals, before[:, _ENDS] + shift[..., None, :])
+        far = (there - positions[..., _UPPER, :]).norm(dim=-1)
+        over = _soft_excess(far - limit) - allowed
+        near = counts * wanted * _soft_excess(_FOLD_LIMIT * lengths - far)
+        weight = ((positions - before)[..., _MASS_JOINTS, :] * _MASSES[:, None]).sum(dim=-2) - shift
         return torch.cat([counts * over / _SIGMA_REACH, near / _SIGMA_REACH, weight[..., ::2] / _SIGMA_BALANCE], dim=-1)
+
+    return residual
 
 
 def _soft_excess(value: Tensor) -> Tensor:
@@ -174,41 +162,24 @@ def bend_limbs(
 
     Feet, and arms without a target, keep their orientations of `before`; joints that are not `turning` stay.
     """
-    orientations = _world_rotations(before)
+    orientations = before.joint_rotations()
     for name, limb in LIMBS.items():
         placed = wanted[:, limb.end] | name.endswith("Foot")
         # Under a trunk that leans, limbs keep their orientation: carried along, knees would end up behind.
         posed = _keep_orientation(posed, limb.upper, orientations[:, limb.upper], turning[:, limb.upper])
-        free = torch.zeros_like(turning)
-        free[:, [limb.upper, limb.lower]] = (turning[:, [limb.upper, limb.lower]].all(dim=1) & placed)[:, None]
         if not bool(placed.any()):
             continue
-        positions = posed.joint_positions().clone()
-        positions[:, limb.end] = torch.where(placed[:, None], ends[:, limb.end], positions[:, limb.end])
-        quats = inverse.solve_inverse_kinematics(
-            positions,
-            posed.local_quat_xyzw,
-            posed.skeleton,
-            free=free,
-            limbs=(limb,),
-            root_position=posed.root_position,
-        )
-        posed = replace(posed, local_quat_xyzw=torch.where(free[..., None], quats, posed.local_quat_xyzw))
+        posed = bend_limb(posed, limb, ends[:, limb.end], placed & turning[:, [limb.upper, limb.lower]].all(dim=1))
         if name.endswith("Foot"):
             posed = _keep_orientation(posed, limb.end, orientations[:, limb.end], turning[:, limb.end])
     return posed
-
-
-def _world_rotations(motion: Motion) -> Float[Tensor, "poses joints 4"]:
-    skeleton = motion.skeleton
-    return forward_kinematics(skeleton.offsets, skeleton.parents, motion.root_position, motion.local_quat_xyzw)[1]
 
 
 def _keep_orientation(
     motion: Motion, joint: int, orientation: Float[Tensor, "poses 4"], chosen: Bool[Tensor, " poses"]
 ) -> Motion:
     """Give a joint this orientation in the world, in the chosen poses."""
-    above = _world_rotations(motion)[:, motion.skeleton.parents[joint]]
+    above = motion.joint_rotations()[:, motion.skeleton.parents[joint]]
     local = rotations.multiply(rotations.inverse(above), orientation)
     quats = motion.local_quat_xyzw.clone()
     quats[:, joint] = torch.where(chosen[:, None], local, quats[:, joint])

@@ -1,6 +1,6 @@
 """Recordings of motion: their masks, artefacts, noise, spikes and gaps, and their fusion with a proposal."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -65,16 +65,8 @@ class Capture:
 
     def slice(self, start: int, stop: int) -> "Capture":
         """Return frames start to stop."""
-        part = slice(start, stop)
-        return Capture(
-            self.root[:, part],
-            self.hips[:, part],
-            self.joints[:, part],
-            self.seen_root[:, part],
-            self.seen[:, part],
-            self.sigma_root,
-            self.sigma,
-        )
+        by_frame = ("root", "hips", "joints", "seen_root", "seen")
+        return replace(self, **{name: getattr(self, name)[:, start:stop] for name in by_frame})
 
     @cached_property
     def heading(self) -> Float[Tensor, "batch frames"]:

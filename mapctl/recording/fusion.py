@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import scipy
@@ -59,55 +59,47 @@ def fuse_rotations(
 ) -> Fused:
     """Estimate rotations (xyzw) from a capture with noise `sigma` of each angle, radians, and a proposal at its rate,
     if there is one. Joints without noise keep what was observed."""
-    capture = choose_continuous_signs(capture)
-    weights = seen.double()
-    smooth = [smooth_columns(capture, weights, hertz, fps) for hertz in _list_cutoffs(fps)]
-    smooth = [torch.nn.functional.normalize(each, dim=-1) for each in smooth]
-    about = smooth[0] if proposal is None else proposal
 
-    def fuse_about(about: Tensor, scale: tuple[float, float], held: bool) -> tuple[Tensor, Tensor, Tensor]:
-        residual, others = _relative_vector(about, capture), [_relative_vector(about, each) for each in smooth]
-        vector, share, error = _estimate(residual, others, weights, sigma, fps, scale, holds_proposal=held)
-        return rotations.multiply(about, rotations.from_rotation_vector(vector)), share, error
+    def turn(start: Tensor, vector: Tensor) -> Tensor:
+        return rotations.multiply(start, rotations.from_rotation_vector(vector))
 
-    return _fuse(fuse_about, about, held=proposal is not None)
+    capture, normalize = choose_continuous_signs(capture), partial(torch.nn.functional.normalize, dim=-1)
+    return _fuse(proposal, capture, seen, sigma, fps, rotations.turns_between, turn, normalize)
 
 
 def fuse_positions(
-    proposal: Float[Tensor, "frames 3"] | None,
+    proposal: Float[Tensor, "frames 3"],
     capture: Float[Tensor, "frames 3"],
     seen: Bool[Tensor, " frames"],
     sigma: float,
     fps: float,
 ) -> Fused:
-    """Estimate positions, metres, from a capture with noise `sigma` of each coordinate, and a proposal, if there is
-    one."""
-    weights = seen.double()[:, None]
-    smooth = [smooth_columns(capture[:, None], weights, hertz, fps) for hertz in _list_cutoffs(fps)]
-    about = smooth[0] if proposal is None else proposal[:, None]
-    level = torch.tensor([sigma], dtype=torch.float64)
-
-    def fuse_about(about: Tensor, scale: tuple[float, float], held: bool) -> tuple[Tensor, Tensor, Tensor]:
-        others = [each - about for each in smooth]
-        vector, share, error = _estimate(
-            capture[:, None] - about, others, weights, level, fps, scale, holds_proposal=held
-        )
-        return about + vector, share, error
-
-    return _fuse(fuse_about, about, held=proposal is not None)
+    """Estimate positions, metres, from a capture with noise `sigma` of each coordinate, and a proposal at its rate."""
+    level, difference = torch.tensor([sigma], dtype=torch.float64), lambda start, stop: stop - start
+    return _fuse(proposal[:, None], capture[:, None], seen[:, None], level, fps, difference, torch.add)
 
 
 def _fuse(
-    fuse_about: Callable[[Tensor, tuple[float, float], bool], tuple[Tensor, Tensor, Tensor]],
-    about: Tensor,
-    *,
-    held: bool,
+    proposal: Tensor | None,
+    capture: Float[Tensor, "frames columns width"],
+    seen: Bool[Tensor, "frames columns"],
+    sigma: Float[Tensor, " columns"],
+    fps: float,
+    difference: Callable[[Tensor, Tensor], Tensor],
+    add: Callable[[Tensor, Tensor], Tensor],
+    normalize: Callable[[Tensor], Tensor] = torch.clone,
 ) -> Fused:
     """Fuse over seconds first, then over moments about that result, which keeps transients of the capture alone. The
     error is that of the first: near a result that follows the capture, the noise is underestimated."""
-    about, share, error = fuse_about(about, _SCALES[0], held)
-    about, again, _ = fuse_about(about, _SCALES[1], True)
-    return Fused(about, share * again, error)
+    weights, holds_proposal = seen.double(), proposal is not None
+    smooth = [normalize(smooth_columns(capture, weights, hertz, fps)) for hertz in _list_cutoffs(fps)]
+    about, found = smooth[0] if proposal is None else proposal, []
+    for scale in _SCALES:
+        residual, others = difference(about, capture), [difference(about, each) for each in smooth]
+        vector, share, error = _estimate(residual, others, weights, sigma, fps, scale, holds_proposal=holds_proposal)
+        about, holds_proposal = add(about, vector), True
+        found.append((share, error))
+    return Fused(about, found[0][0] * found[1][0], found[0][1])
 
 
 def smooth_columns(
@@ -146,10 +138,8 @@ def _estimate(
     holds_proposal: bool,
 ) -> tuple[Float[Tensor, "frames columns 3"], Float[Tensor, "frames columns"], Float[Tensor, "frames columns"]]:
     """Estimate the truth beside the proposal; also the weight of the proposal itself, and the estimated error.
-
-    `residual` is the capture beside the proposal, `smoothed` the smoothed capture beside it; risks are averaged over
-    a time that `scale` gives.
-    """
+    `residual` is the capture beside the proposal, `smoothed` the smoothed capture beside it; risks are averaged over a
+    time that `scale` gives."""
     seconds, caution = scale
     power = (3 * sigma.square()).clamp_min(1e-12)
     ones = torch.ones_like(weights)
@@ -168,16 +158,12 @@ def _estimate(
     finer = max(1.0, fps / PRIOR_FPS)
     frames = min(len(residual), 2 * math.sqrt(math.pi) * seconds * fps) / finer
     doubt = caution * math.sqrt(2 / (3 * frames)) / finer
-    penalties = [_SELECTION * leverage + doubt for leverage in leverages]
-    if not holds_proposal:
-        penalties = [torch.zeros_like(leverage) for leverage in leverages]
-    else:
+    penalties = [(_SELECTION * leverage + doubt) * holds_proposal for leverage in leverages]
+    if holds_proposal:
         nothing = torch.zeros_like(ones)
-        candidates, leverages, penalties = (
-            [torch.zeros_like(residual), *candidates],
-            [nothing, *leverages],
-            [nothing, *penalties],
-        )
+        candidates.insert(0, torch.zeros_like(residual))
+        leverages.insert(0, nothing)
+        penalties.insert(0, nothing)
     changes = [(candidate - residual).square().sum(dim=-1) * weights for candidate in candidates]
     risks = torch.stack([_average(change, near, fps, seconds) for change in changes]) / power
     risks = risks + 2 * torch.stack(leverages) - 1
@@ -237,11 +223,6 @@ def _compute_leverage(frames: int, hertz: float, fps: float) -> Float[Tensor, " 
     return leverage
 
 
-def _relative_vector(start: Tensor, stop: Tensor) -> Float[Tensor, "frames columns 3"]:
-    """Return rotation vectors from one to the other, in the first's frame, radians."""
-    return rotations.to_rotation_vector(rotations.multiply(rotations.inverse(start).expand_as(stop), stop))
-
-
 def upsample(
     values: Float[Tensor, "shown *width"], seconds: Float[Tensor, " shown"], *, fps: float, frames: int
 ) -> Float[Tensor, "frames *width"]:
@@ -264,10 +245,10 @@ def resample_by_splines(motion: Motion, seconds: Float[Tensor, " shown"], *, fps
 def transfer_change(motion: Motion, before: Motion, after: Motion, seconds: Float[Tensor, " shown"]) -> Motion:
     """Change a motion as another, whose frames are at rising times, was changed: what did not change stays as it was
     at the motion's own rate."""
-    turned = rotations.multiply(rotations.inverse(before.local_quat_xyzw), after.local_quat_xyzw)
+    turned = rotations.turns_between(before.local_quat_xyzw, after.local_quat_xyzw)
     angles, moved = (
         upsample(change, seconds, fps=float(motion.fps), frames=motion.num_frames)
-        for change in (rotations.to_rotation_vector(turned), after.root_position - before.root_position)
+        for change in (turned, after.root_position - before.root_position)
     )
     quats = rotations.multiply(motion.local_quat_xyzw, rotations.from_rotation_vector(angles))
     return replace(motion, root_position=motion.root_position + moved, local_quat_xyzw=quats)

@@ -143,10 +143,10 @@ def travel(motion: Motion) -> Float[Tensor, "frames 3"]:
 def inspect_recording(motion: Motion, masks: Sequence[Mask] = ()) -> Inspection:
     """Inspect a recording on any rig; RequestError for masks that name joints or frames it has not."""
     quats, position = choose_continuous_signs(motion.local_quat_xyzw), travel(motion)
-    hidden, hidden_root = expand_valid_masks(motion, masks)
-    spikes, spikes_root = find_angle_spikes(quats, ~hidden), find_position_spikes(position, ~hidden_root)
-    held, frozen = _find_held_frames(quats, position, hidden | spikes, hidden_root | spikes_root)
-    dropouts, dropouts_root = hidden | held | frozen[:, None], hidden_root | frozen
+    hidden = expand_valid_masks(motion, masks)
+    spikes, spikes_root = find_angle_spikes(quats, ~hidden.joints), find_position_spikes(position, ~hidden.root)
+    held, frozen = _find_held_frames(quats, position, hidden.joints | spikes, hidden.root | spikes_root)
+    dropouts, dropouts_root = hidden.joints | held | frozen[:, None], hidden.root | frozen
     # What is found to be false explains no other frame, and each spike corrupts the differences around it.
     spikes, spikes_root = find_angle_spikes(quats, ~dropouts), find_position_spikes(position, ~dropouts_root)
     noise = estimate_angle_noise(quats, ~(dropouts | spikes))
@@ -305,9 +305,7 @@ def _find_spikes(
     values: Float[Tensor, "frames tracks width"], seen: Bool[Tensor, "frames tracks"], log_density: float
 ) -> Bool[Tensor, "frames tracks"]:
     """Find the candidates that are likelier anywhere at all, `log_density`, than where their neighbours lead.
-
-    Neighbours that spike explain nothing: first no candidate counts as a neighbour, then all that were none.
-    """
+    Neighbours that spike explain nothing: first no candidate counts as a neighbour, then all that were none."""
     # Candidates are further from the running median than most about them; more than can spike.
     numbers = values.numpy()
     away = np.linalg.norm(numbers - median_filter(numbers, (_MEDIAN_FRAMES, 1, 1), mode="mirror"), axis=-1)
@@ -332,11 +330,9 @@ def _find_spikes(
 
 
 def _is_rough(values: Float[Tensor, "frames width"], kept: Bool[Tensor, " frames"], start: int, stop: int) -> bool:
-    """Return whether frames `start` to `stop` stand out further than what is left without them.
-
-    Amid a track they lie further from the line between the kept frames beside them than these turn there. At an end,
-    which is seen from one side, they lie further from the line through the next two than any other frame does.
-    """
+    """Return whether frames `start` to `stop` stand out further than what is left without them. Amid a track they lie
+    further from the line between the kept frames beside them than these turn there. At an end, which is seen from one
+    side, they lie further from the line through the next two than any other frame does."""
     before, after = kept[:start].nonzero()[-2:, 0], stop + kept[stop:].nonzero()[:2, 0]
     if len(before) == 2 and len(after) == 2:
         pairs = (before.tolist(), [int(before[1]), int(after[0])], after.tolist())
@@ -403,11 +399,9 @@ def _find_faults(
     ignored: Bool[Tensor, "frames tracks"],
     volumes: Float[Tensor, " tracks"],
 ) -> list[_Run]:
-    """Return the frames of the runs that are no motion, without their first where it still is.
-
-    A run is replaced whose first value is likelier anywhere in `volumes` than where the motion leads, and further from
-    the line through the two frames before it than any other; it is held where its last value lags behind.
-    """
+    """Return the frames of the runs that are no motion, without their first where it still is. A run is replaced whose
+    first value is likelier anywhere in `volumes` than where the motion leads, and further from the line through the two
+    frames before it than any other; it is held where its last value lags behind."""
     if not runs or len(values) < 3:
         return []
     steps = torch.diff(values, dim=0).norm(dim=-1)
@@ -446,8 +440,7 @@ def _find_faults(
 
 
 def _find_loud(prediction: Prediction, free: Bool[Tensor, "frames tracks"]) -> Bool[Tensor, "frames tracks"]:
-    """Find the frames of noisy tracks about which those that are `free` are no more quiet than chance has them: a
-    quantile of chi-squared by its cube root (Wilson and Hilferty 1931)."""
+    """Find frames of noisy tracks no more quiet than those that are `free` (Wilson and Hilferty 1931: chi-squared)."""
     spread, freedom = prediction.spread, prediction.freedom
     usual = torch.where((freedom > 0) & free, spread, math.nan).nanmedian(dim=0).values
     part = 2 / (9 * freedom.clamp_min(1))
@@ -550,10 +543,7 @@ def estimate_lead_shares(canonical: Motion) -> Float[Tensor, " lead"]:
     ahead = torch.nn.functional.normalize(ahead, dim=-1)
     if bool((rotations.to_rotation_vector(ahead[0, upper]).norm(dim=-1) < _ARMS_OUT).all()):
         return torch.zeros(0)
-    whole, gone = (
-        rotations.to_rotation_vector(rotations.multiply(rotations.inverse(quats[:1]).expand_as(ahead), each))
-        for each in (ahead, quats[1 : 1 + longest])
-    )
+    whole, gone = (rotations.turns_between(quats[:1], each) for each in (ahead, quats[1 : 1 + longest]))
     share = (whole * gone).sum(dim=(-1, -2)) / whole.square().sum(dim=(-1, -2)).clamp_min(1e-9)
     free = (share >= _UNBLENDED).nonzero()
     count = int(free[0]) if len(free) else longest

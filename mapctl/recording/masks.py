@@ -8,6 +8,7 @@ from functools import cache
 from os import PathLike
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from mapctl.errors import FileFormatError, RequestError
@@ -17,8 +18,9 @@ from mapctl.joint_names import describe_nearest, find_joint
 from mapctl.joint_roles import classify_joints
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
-from mapctl.retarget import canonical_joints
+from mapctl.retarget import RigMap, canonical_joints
 from mapctl.retarget.rigs import Rig
+from mapctl.skeleton import CANONICAL
 
 _COLUMNS = ("joint", "start", "stop")
 _FRAME = re.compile(r"[+-]?[0-9]{1,12}")
@@ -74,36 +76,92 @@ def masks_from_missing(motion: Motion, missing: MissingValues) -> tuple[Mask, ..
     return (*lost, *(Mask(ROOT, start, stop) for _, start, stop in true_intervals(missing.positions[:, travels, None])))
 
 
-def expand_valid_masks(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, Tensor]:
-    """Expand masks to masked joints (frames, joints) and root positions (frames,), checked.
+@dataclass(frozen=True, eq=False)
+class MissingMask:
+    """Mask of the missing values of a motion."""
 
-    RequestError for joints that the rig has not (with the nearest that it has), frames beyond the end, and joints of
-    which nothing would be left.
-    """
-    for mask in masks:
-        if mask.stop > motion.num_frames:
-            raise RequestError(f"the mask of {mask.joint} ends at {mask.stop}, the recording at {motion.num_frames}")
-    joints, root = expand_masks(motion, masks)
-    if root.all() or joints.all(dim=0).any():
-        gone = "root position" if root.all() else motion.skeleton.names[int(joints.all(dim=0).nonzero()[0])]
-        raise RequestError(f"the masks leave nothing of {gone} in {motion.num_frames} frames")
-    return joints, root
+    joints: Bool[Tensor, "frames joints"]
+    """Whether a joint's rotation is missing, by joint of the rig."""
+    root: Bool[Tensor, " frames"]
+    """Whether the body's position is missing."""
+
+    @staticmethod
+    def of_masks(motion: Motion, masks: Sequence[Mask], rigmap: RigMap, *, keep_position: bool = True) -> "MissingMask":
+        """Build the mask from masks by joint. Where a joint is missing so is its parent's rotation, unless the parent
+        has other children that show it. RequestError for joints and frames that the motion has not, and where nothing
+        of it is left: no joint, or no position of the body unless that may be so."""
+        missing = expand_masks(motion, masks)
+        for child, parent in enumerate(CANONICAL.parents):
+            own, above = rigmap.joint_of[child], rigmap.joint_of[parent] if parent >= 0 else None
+            if own is not None and above is not None and len(CANONICAL.children(parent)) == 1:
+                missing.joints[:, above] |= missing.joints[:, own]
+        if (keep_position and missing.root.all()) or bool(missing.joints.all()):
+            raise RequestError(f"the gaps leave nothing of the motion's {motion.num_frames} frames to go by")
+        return missing
+
+    @staticmethod
+    def of_frames(missing: Bool[Tensor, " frames"], joints: int) -> "MissingMask":
+        """Build the mask of whole frames of a motion with so many joints."""
+        return MissingMask(missing[:, None].expand(-1, joints).clone(), missing)
+
+    @property
+    def frames(self) -> Bool[Tensor, " frames"]:
+        """Frames in which anything is missing."""
+        return self.root | self.joints.any(dim=1)
+
+    @property
+    def known_positions(self) -> Bool[Tensor, "frames joints"]:
+        """Joints of a canonical motion whose world position is known: the root's and all rotations above them are."""
+        known = [~self.root]
+        for parent in CANONICAL.parents[1:]:
+            known.append(known[parent] & ~self.joints[:, parent])
+        return torch.stack(known, dim=1)
+
+    def slice(self, start: int, stop: int) -> "MissingMask":
+        """Return frames start to stop."""
+        return MissingMask(self.joints[start:stop], self.root[start:stop])
 
 
-def expand_masks(motion: Motion, masks: Sequence[Mask]) -> tuple[Tensor, Tensor]:
-    """Expand masks to masked joints (frames, joints) and root positions (frames,)."""
+def restore_observed(motion: Motion, original: Motion, missing: MissingMask) -> Motion:
+    """Return the original with its missing values from `motion`, of the same rig and length; all else to the bit."""
+    moving = {
+        joint: torch.where(missing.root[:, None], motion.moving_offsets[joint], values)
+        for joint, values in original.moving_offsets.items()
+    }
+    return replace(
+        original,
+        moving_offsets=moving,
+        root_position=torch.where(missing.root[:, None], motion.root_position, original.root_position),
+        local_quat_xyzw=torch.where(missing.joints[..., None], motion.local_quat_xyzw, original.local_quat_xyzw),
+    )
+
+
+def expand_valid_masks(motion: Motion, masks: Sequence[Mask]) -> MissingMask:
+    """Expand masks that leave something of every joint; RequestError for others, as `expand_masks`."""
+    missing = expand_masks(motion, masks)
+    lost = [ROOT] * bool(missing.root.all())
+    lost += [motion.skeleton.names[joint] for joint in missing.joints.all(dim=0).nonzero()[:, 0].tolist()]
+    if lost:
+        raise RequestError(f"the masks leave nothing of {lost[0]} in {motion.num_frames} frames")
+    return missing
+
+
+def expand_masks(motion: Motion, masks: Sequence[Mask]) -> MissingMask:
+    """Expand masks by joint; RequestError for joints that the rig has not, and frames beyond the end."""
     names = motion.skeleton.names
     masks = resolve_joint_names(motion, masks)
     joints = torch.zeros(motion.num_frames, len(names), dtype=torch.bool)
     root = torch.zeros(motion.num_frames, dtype=torch.bool)
     for mask in masks:
+        if mask.stop > motion.num_frames:
+            raise RequestError(f"the mask of {mask.joint} ends at {mask.stop}, the recording at {motion.num_frames}")
         if mask.joint in (ALL, ROOT):
             root[mask.start : mask.stop] = True
         if mask.joint == ALL:
             joints[mask.start : mask.stop] = True
         elif mask.joint != ROOT:
             joints[mask.start : mask.stop, names.index(mask.joint)] = True
-    return joints, root
+    return MissingMask(joints, root)
 
 
 def resolve_joint_names(motion: Motion, masks: Sequence[Mask], rig: Rig | None = None) -> tuple[Mask, ...]:
@@ -121,16 +179,10 @@ def resolve_joint_names(motion: Motion, masks: Sequence[Mask], rig: Rig | None =
     return tuple(replace(mask, joint=own.get(mask.joint, mask.joint)) for mask in masks)
 
 
-def slice_masks(masks: Sequence[Mask], start: int, stop: int) -> tuple[Mask, ...]:
-    """Return the masks of frames start to stop, counted from there."""
-    clipped = [Mask(m.joint, max(m.start, start) - start, min(m.stop, stop) - start) for m in masks]
+def slice_masks(masks: Sequence[Mask], start: int, stop: int, *, since: int = 0) -> tuple[Mask, ...]:
+    """Return the masks of frames start to stop, counted from there, as far as they hold from frame `since` on."""
+    clipped = [Mask(m.joint, max(m.start, start, since) - start, min(m.stop, stop) - start) for m in masks]
     return tuple(mask for mask in clipped if mask.start < mask.stop)
-
-
-def trim_masks_before(masks: Sequence[Mask], frame: int) -> tuple[Mask, ...]:
-    """Return the masks as far as they hold from that frame on."""
-    cut = [Mask(m.joint, max(m.start, frame), m.stop) for m in masks]
-    return tuple(mask for mask in cut if mask.start < mask.stop)
 
 
 def write_back_masked(motion: Motion, clean: Motion, masks: Sequence[Mask]) -> Motion:
@@ -139,15 +191,5 @@ def write_back_masked(motion: Motion, clean: Motion, masks: Sequence[Mask]) -> M
     So that a joint which is lost for long is known by its earlier estimate.
     """
     shared = clean.num_frames
-    joints, root = expand_masks(motion, masks)
-    joints, root = joints[:shared], root[:shared]
-    if not bool(joints.any() | root.any()):
-        return motion
-    quats, position = motion.local_quat_xyzw.clone(), motion.root_position.clone()
-    quats[:shared] = torch.where(joints[..., None], clean.local_quat_xyzw, quats[:shared])
-    position[:shared] = torch.where(root[:, None], clean.root_position, position[:shared])
-    moving = dict(motion.moving_offsets)
-    for joint, values in moving.items():
-        kept = torch.where(root[:, None], clean.moving_offsets[joint], values[:shared])
-        moving[joint] = torch.cat([kept, values[shared:]])
-    return replace(motion, local_quat_xyzw=quats, root_position=position, moving_offsets=moving)
+    done = restore_observed(clean, motion.slice(0, shared), expand_masks(motion, masks).slice(0, shared))
+    return done.join(motion.slice(shared, motion.num_frames)) if shared < motion.num_frames else done

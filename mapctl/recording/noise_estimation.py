@@ -75,12 +75,12 @@ def estimate_angle_noise(
     turns end at half a turn and their differences tell too little: what each frame is away from the mean of those
     around it takes their place. Angles that are rounded to a step err uniformly by half of it, however still they seem.
     """
-    steps = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(quats[:-1]), quats[1:]))
+    steps = rotations.turns_between(quats[:-1], quats[1:])
     sigma = _estimate_sigma(steps, seen, differenced=1)
     large = sigma > _LARGE_NOISE
     if large.any():
         mean = rotations.make_sign_continuous(average_over_time(quats[:, large], seen[:, large]))
-        away = rotations.to_rotation_vector(rotations.multiply(rotations.inverse(mean), quats[:, large]))
+        away = rotations.turns_between(mean, quats[:, large])
         about_mean = _estimate_sigma(away, seen[:, large], differenced=0).nan_to_num(0.0)
         sigma[large] = torch.maximum(sigma[large], about_mean)
     known = sigma[(sigma > 0) & sigma.isfinite()]
@@ -90,11 +90,9 @@ def estimate_angle_noise(
 
 
 def _find_step(turns: Float[Tensor, "steps joints"], seen: Bool[Tensor, "frames joints"]) -> Float[Tensor, " joints"]:
-    """Find the step to which a joint's angles are rounded, radians; 0 where they are not.
-
-    One angle that changes by a step turns the joint by just that, whatever the order of its angles: of the turns
-    between two rests, most are equal, and none is smaller.
-    """
+    """Find the step to which a joint's angles are rounded, radians; 0 where they are not. One angle that changes by a
+    step turns the joint by just that, whatever the order of its angles: of the turns between two rests, most are equal,
+    and none is smaller."""
     if len(turns) < 3:
         return turns.new_zeros(turns.shape[1])
     rests = turns < RESOLUTION
@@ -114,9 +112,7 @@ def _estimate_sigma(
     values: Float[Tensor, "some joints 3"], seen: Bool[Tensor, "frames joints"], *, differenced: int
 ) -> Tensor:
     """Estimate sigma by joint, from differences of the highest order with enough runs; NaN where there are not.
-
-    `values` are differences of that order already.
-    """
+    `values` are differences of that order already."""
     sigma = torch.full((values.shape[1],), math.nan, dtype=values.dtype)
     for order, fewest in _ORDERS.items():
         differences, used = torch.diff(values, n=order - differenced, dim=0), _observed_windows(seen, order + 1)

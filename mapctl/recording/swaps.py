@@ -54,8 +54,8 @@ def exchange_swapped_limbs(
         for _, start, stop, joints, exchanged in sorted(found, key=lambda run: -run[0]):
             if free[start:stop].all():
                 free[start:stop] = False
-                turn = rotations.multiply(rotations.inverse(quats[start:stop, joints]), exchanged[start:stop])
-                degrees = math.degrees(float(rotations.to_rotation_vector(turn).norm(dim=-1).max()))
+                turns = rotations.turns_between(quats[start:stop, joints], exchanged[start:stop])
+                degrees = math.degrees(float(turns.norm(dim=-1).max()))
                 quats[start:stop, joints] = exchanged[start:stop]
                 faults.append(Artefact(motion.skeleton.names[joints[0]], start, stop, "swap", degrees, "deg"))
     return (replace(motion, local_quat_xyzw=quats) if faults else motion), faults
@@ -66,10 +66,8 @@ def _find_swaps(
     exchanged: Float[Tensor, "frames limb 4"],
     seen: Bool[Tensor, "frames limb"],
 ) -> list[tuple[float, int, int]]:
-    """Find runs of frames that are likelier exchanged, with the logarithm of how much likelier.
-
-    Candidates lie between two frames from which on the exchanged rotations are nearer to the frame before.
-    """
+    """Find runs of frames that are likelier exchanged, with the logarithm of how much likelier. Candidates lie between
+    two frames from which on the exchanged rotations are nearer to the frame before."""
     same, other = ((1 - (each[1:] * captured[:-1]).sum(dim=-1).abs()).sum(dim=-1) for each in (captured, exchanged))
     turns = (other < same).nonzero()[:, 0].add(1).tolist()
     found = [(0.0, start, stop) for start in turns for stop in turns if 0 < stop - start <= _MOST_FRAMES]

@@ -147,12 +147,7 @@ class Window:
         known = known & self.present[..., None]
         positions = interpolate_positions(self.positions, self.quats, known)
         return PositionImage.of_world(
-            positions,
-            interpolate_heading(self.heading, known),
-            self.contacts,
-            known=known,
-            present=self.present,
-            toes=TOE_JOINTS,
+            positions, interpolate_heading(self.heading, known), self.contacts, known=known, present=self.present
         )
 
 

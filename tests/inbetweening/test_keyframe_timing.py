@@ -8,8 +8,8 @@ from helpers import moved, random_motion, walk
 
 import priors
 from controllers.inbetweening import keyframes
-from mapctl.inbetweening.missing import MissingMask, restore_observed
 from mapctl.intent.keyframes import Keys
+from mapctl.recording.masks import MissingMask, restore_observed
 
 KEYS = Keys((0, 20, 50, 89))
 
@@ -35,7 +35,7 @@ def test_position_in_the_world_and_frames_between_the_keys_change_nothing():
     assert frames(suggest_intervals(moved(motion, turn=2.0, shift=(5.0, -3.0)), KEYS)) == found
     free = torch.ones(90, dtype=torch.bool)
     free[list(KEYS.frames)] = False
-    lost = MissingMask(free[:, None].expand(-1, motion.num_joints).clone(), free)
+    lost = MissingMask.of_frames(free, motion.num_joints)
     assert frames(suggest_intervals(restore_observed(random_motion(motion.skeleton, 90), motion, lost), KEYS)) == found
 
 

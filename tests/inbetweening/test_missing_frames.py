@@ -15,7 +15,7 @@ from tiny_infiller import shown
 from controllers.inbetweening.pipeline import CanonicalClip
 from mapctl import retarget, rotations
 from mapctl.errors import RequestError
-from mapctl.inbetweening.missing import MissingMask, interpolate_missing
+from mapctl.inbetweening.missing import interpolate_missing
 from mapctl.inbetweening.partial_motion import (
     EFFECTORS,
     KnownParts,
@@ -23,7 +23,7 @@ from mapctl.inbetweening.partial_motion import (
     interpolate_partial_motion,
     mirror_quats,
 )
-from mapctl.recording.masks import ALL, ROOT, Mask
+from mapctl.recording.masks import ALL, ROOT, Mask, MissingMask
 from mapctl.skeleton import CANONICAL, LIMBS
 
 
@@ -122,7 +122,7 @@ def test_a_lost_place_takes_the_rotation_that_put_it_there_along(joint, taken):
     ("masks", "message"),
     [
         ([Mask("leftHnad", 5, 9)], "no joint 'leftHnad'.* the nearest is leftHand"),
-        ([Mask(ALL, 5, 31)], "the gap 5:31 ends after the motion's 30 frames"),
+        ([Mask(ALL, 5, 31)], "ends at 31, the recording at 30"),
         ([Mask(ALL, 0, 30)], "leave nothing of the motion's 30 frames"),
         ([Mask(ALL, 0, 15), Mask(ALL, 15, 30)], "leave nothing"),
         ([Mask(ROOT, 0, 30)], "leave nothing"),

@@ -112,13 +112,6 @@ HAND, SHOULDER = CANONICAL.index("leftHand"), CANONICAL.index("leftUpperArm")
 FEET = [CANONICAL.index(name) for name in ("leftFoot", "rightFoot", "leftToes", "rightToes")]
 
 
-def asked(motion, frame, joint, position):
-    positions = motion.joint_positions().clone()
-    wanted = torch.zeros(motion.num_frames, JOINTS, dtype=torch.bool)
-    positions[frame, joint], wanted[frame, joint] = position, True
-    return EffectorTargets(positions, wanted)
-
-
 def reach(motion, targets, *, stray=0.0, turning=None, moving=None):
     all_of_it = torch.ones(motion.num_frames, JOINTS, dtype=torch.bool)
     turning = all_of_it if turning is None else turning
@@ -145,7 +138,7 @@ def beside(motion, frame, *, ahead=0.0, aside=0.0, up=0.0):
 def test_a_hand_gets_there_and_standing_feet_stay(where):
     motion = walk(5, cadence=0.0)
     position = beside(motion, 2, **where)
-    result, shift = reach(motion, asked(motion, 2, HAND, position))
+    result, shift = reach(motion, at(motion, {(2, "leftHand"): position}))
     positions, before = result.joint_positions(), motion.joint_positions()
     assert (positions[2, HAND] - position).norm() < 0.005
     assert (positions[2, FEET] - before[2, FEET]).norm(dim=-1).max() < 0.02  # at most a heel comes up for what is high
@@ -156,7 +149,7 @@ def test_a_hand_gets_there_and_standing_feet_stay(where):
 
 def test_an_oncoming_walker_is_passed_further_off_rather_than_stretched():
     motion = walk(3, cadence=0.0)
-    targets = asked(motion, 1, HAND, beside(motion, 1, ahead=0.9))
+    targets = at(motion, {(1, "leftHand"): beside(motion, 1, ahead=0.9)})
     result, shift = reach(motion, targets, stray=0.5)
     assert shift[1, 2] > 0.3
     feet = (result.joint_positions() - motion.joint_positions())[1, FEET]
@@ -165,15 +158,11 @@ def test_an_oncoming_walker_is_passed_further_off_rather_than_stretched():
 
 def test_what_may_not_move_does_not_and_bones_keep_their_lengths():
     motion = to_canonical(on_rig("bandai", 5))[0]
-    targets = asked(motion, 2, HAND, beside(motion, 2, ahead=0.6))
+    targets = at(motion, {(2, "leftHand"): beside(motion, 2, ahead=0.6)})
     turning = torch.zeros(5, JOINTS, dtype=torch.bool)
     turning[:, [SHOULDER, CANONICAL.index("leftLowerArm")]] = True
     result, _ = reach(motion, targets, turning=turning, moving=torch.zeros(5, dtype=torch.bool))
     kept = ~turning[0]
     assert torch.equal(result.local_quat_xyzw[:, kept], motion.local_quat_xyzw[:, kept])
     assert torch.equal(result.root_position, motion.root_position)
-    bones = [
-        (each[:, 1:] - each[:, list(CANONICAL.parents[1:])]).norm(dim=-1)
-        for each in (result.joint_positions(), motion.joint_positions())
-    ]
-    torch.testing.assert_close(*bones, atol=1e-9, rtol=0)
+    torch.testing.assert_close(lengths(result), lengths(motion), atol=1e-9, rtol=0)

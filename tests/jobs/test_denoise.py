@@ -18,7 +18,7 @@ from mapctl.inbetweening import Proposal
 from mapctl.protocols import Inbetweener
 from mapctl.recording import Capture
 from mapctl.recording.inspection import estimate_lead_shares, hold_rigid_bones
-from mapctl.recording.masks import ALL, Mask
+from mapctl.recording.masks import ALL, Mask, MissingMask, restore_observed
 from mapctl.skeleton import CANONICAL
 
 RIGS = ("canonical", "bandai", "daz")
@@ -144,22 +144,12 @@ def test_what_masked_frames_show_does_not_leak(rig):
 def test_frames_in_which_everything_is_masked_are_filled_in(rig):
     truth = on_rig(rig, 120)
     given = noisy(truth, 2.0, 0.5)
-    quats, root = shaken(given.local_quat_xyzw, 2.0, seed=3), given.root_position + 5
     lost = torch.zeros(120, dtype=torch.bool)
     lost[60:66] = True
-    wild = replace(
-        given,
-        local_quat_xyzw=torch.where(lost[:, None, None], quats, given.local_quat_xyzw),
-        root_position=torch.where(lost[:, None], root, given.root_position),
-    )
-    if given.moving_offsets:
-        wild = replace(
-            wild,
-            root_position=given.root_position,
-            moving_offsets={
-                joint: torch.where(lost[:, None], values + 5, values) for joint, values in given.moving_offsets.items()
-            },
-        )
+    moving = {joint: values + 5 for joint, values in given.moving_offsets.items()}
+    root, quats = given.root_position + 5 * (not moving), shaken(given.local_quat_xyzw, 2.0, seed=3)
+    wild = replace(given, local_quat_xyzw=quats, root_position=root, moving_offsets=moving)
+    wild = restore_observed(wild, given, MissingMask.of_frames(lost, given.num_joints))
     assert error_cm(truth, wild) > 10
     done = cleaned(wild, masks=[Mask(ALL, 60, 66)])
     positions = (done.motion.joint_positions() - truth.joint_positions()).norm(dim=-1).mean(dim=-1)

@@ -9,7 +9,7 @@ from captures import error_cm, noisy, on_rig, shaken
 from tiny_denoiser import QUICK, tiny_denoiser
 
 from controllers.common.map_refinement import RefinementSettings
-from controllers.denoising.causal import CausalDenoiser, CausalSettings, denoise_causal
+from controllers.denoising.causal import CausalDenoiser, denoise_causal
 from mapctl.motion import Motion
 from mapctl.recording.masks import Mask
 from mapctl.solver.budget import Budget
@@ -21,13 +21,13 @@ FAST = replace(
 )
 
 
-def stream(causal=None):
-    return CausalDenoiser(tiny_denoiser(), settings=FAST, causal=causal or CausalSettings(past=0.6))
+def stream(delay=0.2, past=0.6):
+    return CausalDenoiser(tiny_denoiser(), settings=FAST, delay=delay, past=past)
 
 
-def pushed(motion: Motion, at_once: int = 1, causal=None):
+def pushed(motion: Motion, at_once: int = 1, **causal):
     """Results of each push with the number of frames so far; the last is that of finish."""
-    source, given = stream(causal), []
+    source, given = stream(**causal), []
     for first in range(0, motion.num_frames, at_once):
         stop = min(first + at_once, motion.num_frames)
         done = source.push(motion.slice(first, stop))
@@ -48,7 +48,7 @@ def pushed(motion: Motion, at_once: int = 1, causal=None):
 )
 def test_all_frames_come_back_once_and_within_the_delay(rig, fps, delay):
     motion = noisy(on_rig(rig, round(0.7 * fps), fps=fps))
-    given, rest = pushed(motion, causal=CausalSettings(delay=delay, past=0.3))
+    given, rest = pushed(motion, delay=delay, past=0.3)
     count = 0
     for done, come in given:
         assert (come - 1 - count) / fps <= delay + 1e-9  # the oldest of them came that long before the newest
@@ -123,9 +123,7 @@ def test_masks_count_from_the_first_frame_of_all():
 @pytest.mark.parametrize("fps", [24, 29.97, 120])
 @pytest.mark.parametrize("delay", [1 / 30, 0.2])
 def test_the_stated_delay_holds_at_any_rate(fps, delay):
-    causal = CausalSettings(delay=delay)
-    most, step = causal.compute_delay_frames(fps)
-    assert stream(causal).delay == delay
+    most, step = stream(delay).compute_delay_frames(fps)
     assert most / fps <= delay + 1e-9 < (most + 1) / fps + 1e-9
     assert step >= 1
     assert step / fps <= max(delay / 2, 1 / fps) + 0.5 / fps

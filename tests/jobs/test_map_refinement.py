@@ -101,11 +101,12 @@ def test_a_density_counts_less_in_windows_that_are_out_of_its_depth():
     found = {}
     for density in (deep, shallow):
         stood = refine(motion, odds(motion), capture_of(motion), settings, densities=[density])
-        assert [(part.start, part.stop) for part in stood.density_intervals] == [(0, 20), (20, 50)]
+        intervals = stood.density_intervals(stood.motion)
+        assert [(part.start, part.stop) for part in intervals] == [(0, 20), (20, 50)]
         (entry,) = (entry for entry in stood.ledger.entries if entry.name == "likelihood")
-        scale = torch.cat([torch.full((part.stop - part.start,), part.weight) for part in stood.density_intervals])
+        scale = torch.cat([torch.full((part.stop - part.start,), part.weight) for part in intervals])
         assert torch.allclose(entry.energy * settings.temperature, entry.residual * scale, rtol=1e-4)
-        found[density] = {part.weight for part in stood.density_intervals}
+        found[density] = {part.weight for part in intervals}
     assert found[deep] == {1.0}
     assert max(found[shallow]) < 1e-3
 

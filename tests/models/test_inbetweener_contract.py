@@ -9,9 +9,8 @@ from catalogue import INBETWEENERS
 from helpers import moved
 
 from controllers.inbetweening.pipeline import CanonicalClip
-from mapctl.inbetweening.missing import MissingMask
 from mapctl.protocols import Inbetweener
-from mapctl.recording.masks import ALL, Mask
+from mapctl.recording.masks import ALL, Mask, MissingMask
 from mapctl.retarget import to_canonical
 from mapctl.skeleton import CANONICAL
 

@@ -51,19 +51,6 @@ def test_a_mirrored_walk_goes_the_mirrored_way():
     )
 
 
-def test_absent_frames_are_as_if_there_were_nothing():
-    seen = local_motion(60)
-    wild = seen.positions.clone()
-    wild[:, 40:] = 9.0
-    present = seen.present.clone()
-    present[:, 40:] = False
-    network = tiny_path.network()
-    one, other = (
-        outputs(network(LocalMotion(positions, seen.turns, present)))[:, :40] for positions in (seen.positions, wild)
-    )
-    torch.testing.assert_close(one, other, atol=1e-6, rtol=0)
-
-
 def test_the_bundled_one_knows_standing_and_how_far_a_walk_goes():
     predictor, motion = path.load(), walk(90)
     assert "Bandai" in predictor.card.licence or "NC" in predictor.card.licence

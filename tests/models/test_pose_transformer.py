@@ -10,10 +10,9 @@ from tiny_transformer import CONFIG, network, tiny_transformer
 
 from controllers.inbetweening.pipeline import CanonicalClip
 from mapctl import rotations
-from mapctl.inbetweening.missing import MissingMask
 from mapctl.inbetweening.partial_motion import KnownParts
 from mapctl.motion import Motion
-from mapctl.recording.masks import ALL, Mask
+from mapctl.recording.masks import ALL, Mask, MissingMask
 from mapctl.retarget import to_canonical
 from priors import pose_transformer as module
 from priors.training.recipes.pose_transformer import hide

@@ -13,9 +13,8 @@ from controllers.inbetweening.pipeline import CanonicalClip, InfillSettings
 from controllers.inbetweening.proposers import SlerpInbetweener, StitchedInbetweener
 from controllers.inbetweening.tween import tween
 from mapctl.inbetweening.effector_targets import EffectorTargets
-from mapctl.inbetweening.missing import MissingMask
 from mapctl.intent.keyframes import Keys
-from mapctl.recording.masks import ALL, Mask
+from mapctl.recording.masks import ALL, Mask, MissingMask
 from mapctl.retarget import to_canonical
 from priors.stitcher import Draws, Joined, fit_shared, see_ends
 

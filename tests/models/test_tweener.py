@@ -16,10 +16,9 @@ from controllers.inbetweening.proposers import AutoInbetweener, SlerpInbetweener
 from mapctl import joint_ranges, motion_dna
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.inbetweening import PositionImage
-from mapctl.inbetweening.missing import MissingMask
 from mapctl.kinematics import heading
 from mapctl.motion_dna import MotionDna
-from mapctl.recording.masks import ALL, Mask
+from mapctl.recording.masks import ALL, Mask, MissingMask
 from mapctl.retarget import to_canonical
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOE_REST_HEIGHT
 from priors.training.recipes.tweener import collect_dna, compute_classes
@@ -274,7 +273,6 @@ def image_of(motion, keys, *, present=None, known_axes=None):
         torch.zeros(1, motion.num_frames, 2),
         known=known,
         present=torch.ones(1, motion.num_frames, dtype=torch.bool) if present is None else present,
-        toes=TOE_JOINTS,
         known_axes=known_axes,
     )
 

@@ -99,12 +99,11 @@ def test_without_noise_the_capture_is_the_truth_and_gaps_are_the_proposals():
     assert float(apart_deg(fused.values, wanted).max()) < 0.2  # as far beside the truth as the residual on both sides
 
 
-@pytest.mark.parametrize("proposal", [True, False])
-def test_positions_are_fused_in_the_same_manner(proposal):
+def test_positions_are_fused_in_the_same_manner():
     time = torch.arange(240, dtype=torch.float64) / 30
     wanted = torch.stack([time, 0.9 + 0.05 * torch.sin(8 * time), 0 * time], dim=-1)
     capture = wanted + 0.02 * torch.randn(240, 3, generator=generator()).double()
     seen = torch.ones(240, dtype=torch.bool)
-    fused = fuse_positions(wanted if proposal else None, capture, seen, 0.02, 30.0).values[:, 0]
-    assert float((fused - wanted).norm(dim=-1).mean()) < (0.003 if proposal else 0.02)
+    fused = fuse_positions(wanted, capture, seen, 0.02, 30.0).values[:, 0]
+    assert float((fused - wanted).norm(dim=-1).mean()) < 0.003
     assert torch.equal(fuse_positions(wanted + 1.0, capture, seen, 0.0, 30.0).values[:, 0], capture)

@@ -180,13 +180,7 @@ def frozen(motion, start, stop):
     """Frames start to stop repeat the one before them."""
     frame = torch.arange(motion.num_frames)
     frame[start:stop] = start - 1
-    moving = {joint: values[frame] for joint, values in motion.moving_offsets.items()}
-    return replace(
-        motion,
-        root_position=motion.root_position[frame],
-        moving_offsets=moving,
-        local_quat_xyzw=motion.local_quat_xyzw[frame],
-    )
+    return motion.pick(frame)
 
 
 @pytest.mark.parametrize("rig", RIGS)

@@ -48,12 +48,12 @@ def motion():
 
 
 def test_a_joint_a_place_and_everything(motion):
-    joints, root = expand_valid_masks(motion, [Mask("lHand", 3, 7), Mask(ROOT, 10, 12), Mask(ALL, 20, 21)])
+    missing = expand_valid_masks(motion, [Mask("lHand", 3, 7), Mask(ROOT, 10, 12), Mask(ALL, 20, 21)])
     wanted = torch.zeros(40, motion.num_joints, dtype=torch.bool)
     wanted[3:7, motion.skeleton.index("lHand")] = True
     wanted[20] = True
-    assert torch.equal(joints, wanted)
-    assert root.nonzero()[:, 0].tolist() == [10, 11, 20]
+    assert torch.equal(missing.joints, wanted)
+    assert missing.root.nonzero()[:, 0].tolist() == [10, 11, 20]
 
 
 @pytest.mark.parametrize(

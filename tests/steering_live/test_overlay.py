@@ -29,13 +29,7 @@ def steered(motion: Motion, command_at) -> Motion:
 
 def standing(seconds: float) -> Motion:
     """A character that does not move, with arms that hang."""
-    pose = walk(2).slice(0, 1)
-    count = round(seconds * 30)
-    return replace(
-        pose,
-        root_position=pose.root_position.expand(count, 3),
-        local_quat_xyzw=pose.local_quat_xyzw.expand(count, -1, -1),
-    )
+    return walk(2).pick(torch.zeros(round(seconds * 30), dtype=torch.long))
 
 
 def near(motion: Motion, hand: str, away: tuple[float, float, float]) -> tuple[float, float, float]:

@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation
 from mapctl import rotations
 from mapctl.contacts import ContactSettings
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode
-from mapctl.inbetweening.missing import MissingMask, interpolate_missing
+from mapctl.inbetweening.missing import interpolate_missing
 from mapctl.motion import Motion
 from mapctl.pose import BodyPose, decode
+from mapctl.recording.masks import MissingMask
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.training.augment import add_copies, copy_clip
 from priors.training.data import Corpus
