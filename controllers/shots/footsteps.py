@@ -48,6 +48,10 @@ class Footstep:
     toe: tuple[float, float] = (0.0, 0.0)
     """Toe joint on the foothold, x and z, world, metres."""
 
+    def swing_at(self, clock: Float[Tensor, " frames"]) -> Float[Tensor, " frames"]:
+        """Return the shares of the swing at frames: 0 at its lift, 1 at its landing."""
+        return (clock - self.lift) / (self.land - self.lift)
+
     def as_row(self) -> dict[str, Any]:
         """Return the row of a report: foot, seconds of lift and landing, toe joint."""
         seconds = {"lift_seconds": self.lift / PRIOR_FPS, "land_seconds": self.land / PRIOR_FPS}
@@ -191,7 +195,7 @@ def _measure_strain(displacement: Displacement, plan: Sequence[Footstep]) -> flo
 
 _CLEARANCE = 0.035  # metres of the toe in mid-swing over its rest height, as of walking people (see terms.Clearance)
 _TOE_OFF, _TOE_OFF_METRE = math.radians(35.0), math.radians(60.0)  # pitch of a foot as it leaves, at most and per metre
-_ROLL, _LONG_ROLL = 4, 8  # frames over which a heel rises while the toe stands: in a step, and at the end of a walk
+_ROLL = 6  # frames over which a heel rises while the toe stands, where there are as many
 _SWAY = 0.02  # metres by which hips go aside to the foot that stands
 _STRETCHED = 0.985  # share of a leg's length at which its hip goes lower
 _SMOOTH = 3.0  # frames (sigma) over which hips follow their support
@@ -205,28 +209,19 @@ def take_steps(displacement: Displacement, plan: Sequence[Footstep], frames: int
     """
     start, stop = displacement.start, displacement.stop
     clock = torch.arange(frames, dtype=torch.float64)
-    toes, turns, shares, sways = [], [], [], torch.zeros(frames, dtype=torch.float64)
+    toes, turns, share, sways = [], [], torch.zeros_like(clock), torch.zeros_like(clock)
     for foot in range(2):
-        share = torch.zeros(frames, dtype=torch.float64)
-        lifted, pitches, held = torch.zeros_like(share), list[tuple[Tensor, float]](), 0.0
-        for step in (step for step in plan if step.foot == foot):
-            swing = (clock - step.lift) / (step.land - step.lift)
-            share = share + (step.share - held) * smootherstep(swing)
-            ends = displacement.toes_at(foot, torch.tensor([held, step.share], dtype=torch.float64))[0]
-            away = float((ends[1] - ends[0]).norm())
-            lifted = lifted + _CLEARANCE * torch.sin(math.pi * swing.clamp(0, 1)).square()
-            rise = (clock - step.lift + _ROLL) / (_ROLL + 0.6 * (step.land - step.lift))
-            pitches.append((rise, away))
-            sways = sways + (-1.0 if foot == 0 else 1.0) * _SWAY * torch.sin(math.pi * swing.clamp(0, 1)).square()
-            held = step.share
-        position, turn = displacement.toes_at(foot, share)
-        toes.append(position + torch.stack([0 * lifted, lifted, 0 * lifted], dim=-1))
-        for rise, away in pitches:
-            turn = _pitch(turn, rise, away)
+        steps, held, swings = [step for step in plan if step.foot == foot], 0.0, list[_Swing]()
+        stands = displacement.toes_at(foot, torch.tensor([0.0, *(step.share for step in steps)], dtype=torch.float64))
+        for step, position, turn in zip(steps, stands[0][1:], stands[1][1:], strict=True):
+            swings.append(_Swing(step, position, turn))
+            share = share + 0.5 * (step.share - held) * smootherstep(step.swing_at(clock))
+            lifted = torch.sin(math.pi * step.swing_at(clock).clamp(0, 1)).square()
+            sways, held = sways + (-_SWAY if foot == 0 else _SWAY) * lifted, step.share
+        position, turn = _swing_foot(clock, stands[0][0], stands[1][0], swings)
+        toes.append(position)
         turns.append(turn)
-        shares.append(share)
-    share = _smooth_between((shares[0] + shares[1]) / 2)
-    hips = displacement.hips_at(share)
+    hips = displacement.hips_at(_smooth_between(share))
     aside = rotations.rotate_ground(torch.stack([_smooth_between(sways), 0 * sways], dim=-1), hips[:, 2])
     weight = smootherstep(clock / (frames - 1))
     root = torch.lerp(start.root_position, stop.root_position, weight[:, None])
@@ -240,11 +235,60 @@ def take_steps(displacement: Displacement, plan: Sequence[Footstep], frames: int
     return _stand_on(motion, torch.stack(toes, dim=1), torch.stack(turns, dim=1))
 
 
-def _pitch(turn: Float[Tensor, "frames 4"], rise: Float[Tensor, " frames"], away: float) -> Float[Tensor, "frames 4"]:
-    """Pitch a foot down over shares 0 to 1 of its toe-off, the more the farther it goes, metres."""
-    pitch = min(_TOE_OFF, _TOE_OFF_METRE * away) * torch.sin(math.pi * rise.clamp(0, 1)).square()
+@dataclass(frozen=True, eq=False)
+class _Swing:
+    """A step as a foot takes it."""
+
+    step: Footstep
+    position: Float[Tensor, "3"]
+    """Toe joint on the foothold, world, metres."""
+    turn: Float[Tensor, "4"]
+    """Rotation of the foot there, world."""
+    velocity: Float[Tensor, "3"] | None = None
+    """Velocity of a toe that is in the air already, m/s; None of a foot that stands, and whose heel rises first."""
+
+
+def _swing_foot(
+    clock: Float[Tensor, " frames"], toe: Float[Tensor, "3"], turn: Float[Tensor, "4"], swings: Sequence[_Swing]
+) -> tuple[Float[Tensor, "frames 3"], Float[Tensor, "frames 4"]]:
+    """Swing a foot from where it stands along its steps; return position of the toe joint and rotation of the foot.
+
+    The toe takes a path of minimum jerk (Flash and Hogan 1985) and clears the ground; the heel rises before it leaves.
+    """
+    toes, turns, pitch = toe.expand(len(clock), 3), turn.expand(len(clock), 4), torch.zeros_like(clock)
+    for swing in swings:
+        share, step = swing.step.swing_at(clock).clamp(0, 1), swing.step
+        velocity = torch.zeros(3, dtype=clock.dtype) if swing.velocity is None else swing.velocity.to(clock)
+        path = _swing_to(toe, velocity * (step.land - step.lift) / PRIOR_FPS, swing.position, share)
+        height = _clear_ground(path[:, 1], torch.lerp(toe[1], swing.position[1], smootherstep(share)), share)
+        toes = torch.where((share > 0)[:, None], torch.stack([path[:, 0], height, path[:, 2]], dim=-1), toes)
+        turns = rotations.slerp(turns, swing.turn.expand(len(clock), 4), smootherstep(share))
+        if swing.velocity is None:
+            roll = min(_ROLL, step.lift - int(clock[0]))
+            rise = (clock - step.lift + roll) / (roll + 0.6 * (step.land - step.lift))
+            most = min(_TOE_OFF, _TOE_OFF_METRE * float((swing.position - toe).norm()))
+            pitch = torch.maximum(pitch, most * torch.sin(math.pi * rise.clamp(0, 1)).square())
+        toe = swing.position
     down = torch.stack([pitch, 0 * pitch, 0 * pitch], dim=-1)
-    return rotations.multiply(turn, rotations.from_rotation_vector(down))
+    return toes, rotations.multiply(turns, rotations.from_rotation_vector(down))
+
+
+def _swing_to(
+    begin: Float[Tensor, "3"], velocity: Float[Tensor, "3"], end: Float[Tensor, "3"], share: Float[Tensor, " frames"]
+) -> Float[Tensor, "frames 3"]:
+    """Go from one point, at a velocity per unit of the share, to rest at another, from no acceleration."""
+    share, away = share[:, None], end - begin
+    third, fourth, fifth = 10 * away - 6 * velocity, -15 * away + 8 * velocity, 6 * away - 3 * velocity
+    return begin + share * (velocity + share**2 * (third + share * (fourth + share * fifth)))
+
+
+def _clear_ground(
+    height: Float[Tensor, " frames"], rest: Float[Tensor, " frames"], swing: Float[Tensor, " frames"]
+) -> Float[Tensor, " frames"]:
+    """Bring a toe's heights, metres, over the clearance of its swing, by a smooth maximum of both."""
+    window = torch.sin(math.pi * swing).square()
+    short = rest + _CLEARANCE * window - height
+    return height + 0.5 * (short + (short.square() + (0.5 * _CLEARANCE * window).square()).sqrt())
 
 
 def _without_heading(pose: Motion) -> Float[Tensor, "1 joints 4"]:
@@ -341,29 +385,22 @@ class LastSteps:
 
     def take(self) -> Motion:
         """Bring the feet along the steps; hips go lower where a leg does not reach."""
-        part = slice(self.start, self.stop + 1)
         clock = torch.arange(self.start, self.stop + 1, dtype=torch.float64)
-        rotation = self.motion.joint_rotations()
-        toes, turns = self._toes[part].clone(), []
+        rotation, plan, toes, turns = self.motion.joint_rotations(), self.plan(), [], []
         for foot in range(2):
-            begin, end = self._toes[self.start, foot], self._toes[self.stop, foot]
-            one, other = (rotation[at, CANONICAL.index(FEET[foot])] for at in (self.start, self.stop))
-            step = next((step for step in self.plan() if step.foot == foot), None)
-            lift, land = (self.start, self.stop) if step is None else (step.lift, step.land)
-            swing = (clock - lift) / (land - lift)
-            under_way = lift == self.start and step is not None
-            velocity = self._velocities[foot] * (land - lift) / PRIOR_FPS if under_way else torch.zeros(3)
-            toes[:, foot] = _swing_to(begin, velocity.to(begin), end, swing)
-            turn = rotations.slerp(one.expand(len(clock), 4), other.expand(len(clock), 4), smootherstep(swing))
-            if step is not None:
-                rest = torch.lerp(begin[1], end[1], smootherstep(swing))
-                toes[:, foot, 1] = _clear_ground(toes[:, foot, 1], rest, swing)
-            if step is not None and not under_way:  # the heel rises while the body goes on over the toe
-                rise = (clock - lift + _LONG_ROLL) / (_LONG_ROLL + 0.6 * (land - lift))
-                turn = _pitch(turn, rise, float((end - begin).norm()))
+            begin, end = (self._toes[at, foot] for at in (self.start, self.stop))
+            first, last = (rotation[at, CANONICAL.index(FEET[foot])] for at in (self.start, self.stop))
+            step = next((step for step in plan if step.foot == foot), None)
+            if step is None:  # it stands where it is to stand, but for a little
+                share = smootherstep((clock - self.start) / (self.stop - self.start))
+                toe = torch.lerp(begin, end, share[:, None])
+                turn = rotations.slerp(first.expand(len(clock), 4), last.expand(len(clock), 4), share)
+            else:
+                velocity = self._velocities[foot] if step.lift == self.start else None
+                toe, turn = _swing_foot(clock, begin, first, [_Swing(step, end, last, velocity)])
+            toes.append(toe)
             turns.append(turn)
-        frames = self.motion.slice(self.start, self.stop + 1)
-        return _stand_on(frames, toes, torch.stack(turns, dim=1))
+        return _stand_on(self.motion.slice(self.start, self.stop + 1), torch.stack(toes, 1), torch.stack(turns, 1))
 
     @property
     def _toes(self) -> Float[Tensor, "frames 2 3"]:
@@ -373,22 +410,3 @@ class LastSteps:
     def _velocities(self) -> Float[Tensor, "2 3"]:
         """Velocities of the toes in the walk's last frame, m/s."""
         return (self._toes[self.start] - self._toes[self.start - 1]) * PRIOR_FPS
-
-
-def _swing_to(
-    begin: Float[Tensor, "3"], velocity: Float[Tensor, "3"], end: Float[Tensor, "3"], share: Float[Tensor, " frames"]
-) -> Float[Tensor, "frames 3"]:
-    """Go from one point, at a velocity per unit of the share, to rest at another: minimum jerk (Flash and Hogan 1985),
-    from no acceleration."""
-    share, away = share.clamp(0, 1)[:, None], end - begin
-    third, fourth, fifth = 10 * away - 6 * velocity, -15 * away + 8 * velocity, 6 * away - 3 * velocity
-    return begin + share * (velocity + share**2 * (third + share * (fourth + share * fifth)))
-
-
-def _clear_ground(
-    height: Float[Tensor, " frames"], rest: Float[Tensor, " frames"], swing: Float[Tensor, " frames"]
-) -> Float[Tensor, " frames"]:
-    """Bring a toe's heights, metres, over the clearance of its swing, by a smooth maximum of both."""
-    window = torch.sin(math.pi * swing.clamp(0, 1)).square()
-    short = rest + _CLEARANCE * window - height
-    return height + 0.5 * (short + (short.square() + (0.5 * _CLEARANCE * window).square()).sqrt())

@@ -71,7 +71,7 @@ def draw_shot(generator: torch.Generator, clip: Motion) -> tuple[ShotRequest, tu
         at, speed = uniform(2.5, 4.0), uniform(0.9, 1.3)
         pairs = ((at, speed), (at + 1.0, 0.0), (at + 2.2, 0.0), (at + 3.2, speed))
         request = replace(request, speed=TimedSpeed.parse(pairs))
-    if "obstacle" in chosen:
+    if "obstacle" in chosen and curve.length > 4:
         along, aside = uniform(0.3, 0.7) * curve.length, uniform(-0.4, 0.4)
         x, z = (curve.point(along) + aside * curve.left(along)).tolist()
         request = replace(request, obstacles=(Obstacle((x, z), uniform(0.2, 0.6)),))
@@ -166,10 +166,11 @@ def main(words: list[str] | None = None) -> None:
     for number in range(given.shots):
         clips = circles[number % len(circles)].clips
         canonical, rigged = RiggedCharacter.of(clips[number // len(circles) % len(clips)].motion)
-        request, kinds = draw_shot(generator, canonical)
         settings = FollowSettings().with_rest_height(float(rigged.stance.toe_height.mean()))
-        began = time.process_time()
+        began, kinds, length = time.process_time(), (), 0.0
         try:
+            request, kinds = draw_shot(generator, canonical)
+            length = request.curve.length
             shot = solve_shot(
                 prior, inbetweener, request, generator=seeded(number), settings=settings, skeleton=canonical.skeleton
             )
@@ -178,7 +179,7 @@ def main(words: list[str] | None = None) -> None:
         except RequestError as error:
             shot, line = None, f"refused: {error}"
         if given.print:
-            print(number, f"{request.curve.length:.1f} m;", ", ".join(kinds), "->", line, flush=True)
+            print(number, f"{length:.1f} m;", ", ".join(kinds), "->", line, flush=True)
         shots.append((kinds, shot))
     rows = [
         summarise(kind, [shot for kinds, shot in shots if kind in kinds])
