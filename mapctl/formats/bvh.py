@@ -27,6 +27,7 @@ from mapctl.errors import FileFormatError, RequestError
 from mapctl.formats import euler, missing
 from mapctl.formats.atomic import write_bytes
 from mapctl.formats.missing import MissingValues
+from mapctl.formats.parts import make_unique
 from mapctl.formats.text import (
     LARGEST_VALUE,
     NUMBER,
@@ -51,7 +52,6 @@ AXES = {"X": 0, "Y": 1, "Z": 2}
 
 _WORD = re.compile(r"\s*+([{}]|[^\s{}]++)")
 _NAME = re.compile(r"\s*+([^\n{}]*+)")
-_JOINT_LINE = re.compile(r"^[ \t]*(?:ROOT|JOINT)[ \t]+([^\n{}]+)", re.IGNORECASE | re.MULTILINE)
 _CHANNEL = re.compile(r"([XYZ])(position|rotation)", re.IGNORECASE)
 
 Offset = tuple[float, float, float]
@@ -170,10 +170,8 @@ class _Node:
 def read_hierarchy(scanner: Scanner) -> Hierarchy:
     """Read from HIERARCHY to the word MOTION, which is taken too."""
     scanner.expect("HIERARCHY")
-    joints: dict[str, _Node] = {}
+    joints, opened = list[_Node](), list[_Node]()
     ends: dict[int, _Node] = {}
-    opened: list[_Node] = []
-    renamed: list[str] = []
     while (word := scanner.word().upper()) != "MOTION":
         if word not in ("ROOT", "JOINT", "END", "OFFSET", "CHANNELS", "}"):
             allowed = "OFFSET, CHANNELS, JOINT, End Site or '}'" if opened else "ROOT or MOTION"
@@ -181,7 +179,7 @@ def read_hierarchy(scanner: Scanner) -> Hierarchy:
         if word == "ROOT":
             if joints:
                 scanner.fail("a second ROOT, allowed is one")
-            opened.append(_open_joint(scanner, joints, -1, renamed))
+            opened.append(_open_joint(scanner, joints, -1))
             continue
         if not opened:
             scanner.fail(f"{word} outside of a joint, expected ROOT or MOTION")
@@ -189,7 +187,7 @@ def read_hierarchy(scanner: Scanner) -> Hierarchy:
         if word == "JOINT":
             if node.is_end:
                 scanner.fail("a JOINT within an End Site, expected OFFSET or '}'")
-            opened.append(_open_joint(scanner, joints, node.number, renamed))
+            opened.append(_open_joint(scanner, joints, node.number))
         elif word == "END":
             if node.is_end or node.number in ends:
                 scanner.fail(f"a second End Site in {node}")
@@ -212,31 +210,32 @@ def read_hierarchy(scanner: Scanner) -> Hierarchy:
     if opened or not joints:
         lacks = f"'}}' before MOTION: {opened[-1]} is still open" if opened else "ROOT before MOTION"
         scanner.fail(f"expected {lacks}")
+    names = make_unique([node.name for node in joints])
+    renamed = [
+        f"the joint {shorten(node.name)} of line {node.line} as {name!r}"
+        for node, name in zip(joints, names, strict=True)
+        if name != node.name
+    ]
     if renamed:
         more = f" and {len(renamed) - 3} more" if len(renamed) > 3 else ""
         warn_once(f"{scanner.path}: names must be unique, so it reads {', '.join(renamed[:3])}{more}")
     return Hierarchy(
-        names=tuple(joints),
-        parents=tuple(node.parent for node in joints.values()),
-        offsets=tuple(node.offset or _ORIGIN for node in joints.values()),
-        channels=tuple(node.channels or () for node in joints.values()),
+        names=tuple(names),
+        parents=tuple(node.parent for node in joints),
+        offsets=tuple(node.offset or _ORIGIN for node in joints),
+        channels=tuple(node.channels or () for node in joints),
         end_offsets={joint: node.offset or _ORIGIN for joint, node in ends.items()},
     )
 
 
-def _open_joint(scanner: Scanner, joints: dict[str, _Node], parent: int, renamed: list[str]) -> _Node:
-    """Read a joint's name and brace. One whose name is taken gets one that no joint of the file has: `Bip01_2` for the
-    second Bip01."""
-    own = name = scanner.name()
+def _open_joint(scanner: Scanner, joints: list[_Node], parent: int) -> _Node:
+    """Read a joint's name and brace."""
+    name = scanner.name()
     if len(joints) == MAX_JOINTS:
         scanner.fail(f"more than {MAX_JOINTS} joints, which is the most allowed")
-    if name in joints:
-        taken = {line.strip() for line in _JOINT_LINE.findall(scanner.text)} | set(joints)
-        own = next(own for number in count(2) if (own := f"{name}_{number}") not in taken)
-        renamed.append(f"the joint {shorten(name)} of line {scanner.line} as {own!r}")
-    joints[own] = _Node(own, len(joints), parent, scanner.line)
+    joints.append(_Node(name, len(joints), parent, scanner.line))
     scanner.expect("{")
-    return joints[own]
+    return joints[-1]
 
 
 def _read_channels(scanner: Scanner, node: _Node) -> tuple[str, ...]:
