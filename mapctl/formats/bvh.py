@@ -137,13 +137,16 @@ class Hierarchy:
         joints = self._columns()
         return [{AXES[c[0]]: column for c, column in joint if c.endswith("position")} for joint in joints]
 
+    def rotation_columns(self) -> list[tuple[tuple[int, ...], list[int]]]:
+        """Return by joint its Euler order, as axes, and the columns of its angles."""
+        turns = [[(AXES[c[0]], column) for c, column in joint if c.endswith("rotation")] for joint in self._columns()]
+        return [(tuple(axis for axis, _ in joint), [column for _, column in joint]) for joint in turns]
+
     def rotation_groups(self) -> list[tuple[tuple[int, ...], list[int], np.ndarray]]:
         """Group joints by Euler order, to be converted together: axes, joints, and columns (joints, axes)."""
         groups: dict[tuple[int, ...], dict[int, list[int]]] = {}
-        for joint, channels in enumerate(self._columns()):
-            turns = [(AXES[c[0]], column) for c, column in channels if c.endswith("rotation")]
-            axes = tuple(axis for axis, _ in turns)
-            groups.setdefault(axes, {})[joint] = [column for _, column in turns]
+        for joint, (axes, columns) in enumerate(self.rotation_columns()):
+            groups.setdefault(axes, {})[joint] = columns
         return [(axes, list(g), np.array(list(g.values()), dtype=int)) for axes, g in groups.items()]
 
     def _columns(self) -> list[list[tuple[str, int]]]:
@@ -626,23 +629,18 @@ def _keep_source_values(
     turns, positions = as_array(before.local_quat_xyzw), all_translations(before) / layout.metres_per_unit
     turned = (turns == quat_xyzw).all(-1) | (turns == -quat_xyzw).all(-1)
     there = np.all(np.isclose(positions, translations, rtol=1e-12, atol=1e-12), axis=-1)
-    same = [now == then for now, then in zip(tree.channels, old.channels, strict=True)]
-    for joint, (now, then) in enumerate(zip(tree.position_columns(), old.position_columns(), strict=True)):
-        if same[joint]:
-            at, numbers = list(now.values()), own[:, list(then.values())]
-            kept = there[:, joint] & np.isfinite(numbers).all(-1)
-            values[:, at] = np.where(kept[:, None], numbers, values[:, at])
-    read = {
-        joint: columns
-        for _, joints, group in old.rotation_groups()
-        for joint, columns in zip(joints, group, strict=True)
-    }
-    for axes, joints, group in tree.rotation_groups():
-        for joint, at in zip(joints, group, strict=True):
-            if same[joint] and turned[:, joint].any():
-                numbers = own[:, read[joint]]
-                kept = turned[:, joint] & np.isfinite(numbers).all(-1)
-                values[:, at] = euler.keep_source_angles(values[:, at], numbers, kept, axes)
+    now, then = ((t.channels, t.position_columns(), t.rotation_columns()) for t in (tree, old))
+    for joint, (channels, position, (axes, at)) in enumerate(zip(*now, strict=True)):
+        if channels != then[0][joint]:
+            continue
+        numbers = own[:, list(then[1][joint].values())]
+        kept = there[:, joint] & np.isfinite(numbers).all(-1)
+        columns = list(position.values())
+        values[:, columns] = np.where(kept[:, None], numbers, values[:, columns])
+        numbers = own[:, then[2][joint][1]]
+        kept = turned[:, joint] & np.isfinite(numbers).all(-1)
+        if kept.any():
+            values[:, at] = euler.keep_source_angles(values[:, at], numbers, kept, axes)
     return values
 
 
