@@ -63,37 +63,49 @@ _KEYWORDS = (
 
 
 @dataclass(frozen=True, eq=False)
+class Bone:
+    """A bone of a skeleton; the root is one without length."""
+
+    name: str
+    """Name as written."""
+    line: int
+    """Line of the file on which it begins."""
+    end: np.ndarray
+    """(3,) from the bone's start to its end at rest, in world axes, file unit."""
+    axis_quat_xyzw: np.ndarray
+    """(4,) rotation of the frame that a bone's angles are about, at rest; for the root its pre-set rotation."""
+    channels: tuple[str, ...]
+    """Channels in an AMC line, as `tx` or `rz`; empty for a bone that never rotates."""
+
+
+@dataclass(frozen=True, eq=False)
 class AsfSkeleton:
     """Bones, the root first and every parent before its children. Lengths are in the file's unit."""
 
-    names: tuple[str, ...]
-    """Bone names as written; the first is `root`."""
+    bones: tuple[Bone, ...]
+    """The root, then all others."""
     parents: tuple[int, ...]
     """Index of each bone's parent; -1 for the root."""
-    ends: np.ndarray
-    """(bones, 3) from each bone's start to its end at rest, in world axes; zero for the root."""
-    axis_quat_xyzw: np.ndarray
-    """(bones, 4) rotation of the frame that a bone's angles are about, at rest; for the root its pre-set rotation."""
-    channels: tuple[tuple[str, ...], ...]
-    """Channels of each bone in an AMC line, as `tx` or `rz`; empty for a bone that never rotates."""
     root_position: np.ndarray
-    """(3,) added to the root's position in every frame, file unit."""
+    """(3,) added to the root's position in every frame."""
     length: float
     """`length` of :units: so many units to the inch; 1 is no information."""
     degrees: bool
     """Whether angles are in degrees."""
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the bones."""
+        return tuple(bone.name for bone in self.bones)
 
-@dataclass(frozen=True, eq=False)
-class AmcText:
-    """Content of an AMC file."""
-
-    values: np.ndarray
-    """(frames, channels) in the order of the skeleton's bones and channels, file units."""
-    degrees: bool | None
-    """Whether angles are in degrees; None where the file does not state it."""
-    fps: Fraction | None
-    """Frames per second; None where the file does not state them, as most do not."""
+    def columns(self, kind: str) -> list[tuple[tuple[int, ...], list[int]]]:
+        """Return by bone the axes of its channels of a kind, `t` or `r`, in file order, and their columns."""
+        found, start = [], 0
+        for bone in self.bones:
+            wanted = [(channel, start + number) for number, channel in enumerate(bone.channels) if channel[0] == kind]
+            found.append((tuple("xyz".index(channel[1]) for channel, _ in wanted), [column for _, column in wanted]))
+            start += len(bone.channels)
+        return found
 
 
 def read(
@@ -112,29 +124,27 @@ def read(
     except OSError as error:  # as a name that is too long, or a folder that may not be listed
         raise FileFormatError(path, f"cannot be read: {error.strerror or error}") from error
     asf = read_asf(subject)
-    text = read_amc(take, asf, lossy=lossy)
-    check_extent(take, len(text.values), len(asf.names))
-    missing.check_any_known(take, np.isnan(text.values))
-    degrees = asf.degrees if text.degrees is None else text.degrees
+    values, degrees, own_fps = read_amc(take, asf, lossy=lossy)
+    check_extent(take, len(values), len(asf.bones))
+    lost = np.isnan(values)
+    missing.check_any_known(take, lost)
     skeleton, unit = _build_skeleton(asf)
-    positions = missing.interpolate_nan(_positions(asf, text.values), np.zeros(3))
+    axes, columns = asf.columns("t")[0]
+    positions = np.zeros((len(values), 3))
+    positions[:, list(axes)] = values[:, columns]
+    positions = missing.interpolate_nan(positions, np.zeros(3)) + asf.root_position
     motion = Motion(
         skeleton=skeleton,
-        fps=Fraction(fps or text.fps or USUAL_FPS).limit_denominator(100_000),
-        root_position=torch.from_numpy((positions + asf.root_position) * unit.metres_per_unit),
-        local_quat_xyzw=_quaternions(asf, missing.hold_last(text.values), degrees=degrees),
+        fps=Fraction(fps or own_fps or USUAL_FPS).limit_denominator(100_000),
+        root_position=torch.from_numpy(positions * unit.metres_per_unit),
+        local_quat_xyzw=_quaternions(asf, missing.hold_last(values), degrees=degrees),
         source=unit,
     )
-    return motion, _find_missing(asf, np.isnan(text.values))
-
-
-def _find_missing(asf: AsfSkeleton, lost: np.ndarray) -> MissingValues:
-    """Find the missing values by bone; a bone without channels is missing where all channels are."""
-    whole = lost.all(axis=1)
-    turns = [lost[:, columns].any(axis=1) | whole for _, columns in _columns(asf, "r")]
-    positions = np.zeros((len(lost), len(turns)), dtype=bool)
-    positions[:, 0] = lost[:, _columns(asf, "t")[0][1]].any(axis=1)
-    return MissingValues(torch.from_numpy(np.stack(turns, axis=1)), torch.from_numpy(positions))
+    # a bone without channels is missing where all channels are
+    turns = [lost[:, own].any(axis=1) | lost.all(axis=1) for _, own in asf.columns("r")]
+    moved = np.zeros((len(values), len(turns)), dtype=bool)
+    moved[:, 0] = lost[:, columns].any(axis=1)
+    return motion, MissingValues(torch.from_numpy(np.stack(turns, axis=1)), torch.from_numpy(moved))
 
 
 def find_paths(path: str | PathLike[str]) -> tuple[Path, Path]:
@@ -164,44 +174,26 @@ def find_paths(path: str | PathLike[str]) -> tuple[Path, Path]:
 
 def _build_skeleton(asf: AsfSkeleton) -> tuple[Skeleton, FileUnit]:
     """Build joints at the bones' starts, in metres; also return the file's unit."""
-    parents = list(asf.parents)
-    offsets = np.concatenate([np.zeros((1, 3)), asf.ends[parents[1:]]])
-    leaves = [bone for bone in range(1, len(parents)) if bone not in set(parents)]
+    names, parents = asf.names, list(asf.parents)
+    ends = np.array([bone.end for bone in asf.bones])
+    offsets = np.concatenate([np.zeros((1, 3)), ends[parents[1:]]])
+    leaves = [bone for bone in range(1, len(parents)) if bone not in parents]
     unit = FileUnit(_INCH / asf.length)
     if asf.length == 1:
-        ends = {bone: asf.ends[bone].tolist() for bone in leaves}
-        unit = guess_unit(asf.names, parents, offsets, end_offsets=ends)
+        unit = guess_unit(names, parents, offsets, end_offsets={bone: ends[bone].tolist() for bone in leaves})
     scale = unit.metres_per_unit
-    sites = {asf.names[bone]: tuple((asf.ends[bone] * scale).tolist()) for bone in leaves}
-    return Skeleton(asf.names, asf.parents, torch.from_numpy(offsets * scale), sites), unit
-
-
-def _columns(asf: AsfSkeleton, kind: str) -> list[tuple[tuple[int, ...], list[int]]]:
-    """Return by bone the axes of its channels of a kind, `t` or `r`, in file order, and their columns."""
-    found, start = [], 0
-    for channels in asf.channels:
-        wanted = [(channel, start + number) for number, channel in enumerate(channels) if channel[0] == kind]
-        found.append((tuple("xyz".index(channel[1]) for channel, _ in wanted), [column for _, column in wanted]))
-        start += len(channels)
-    return found
-
-
-def _positions(asf: AsfSkeleton, values: np.ndarray) -> np.ndarray:
-    """Return root positions (frames, 3), file unit."""
-    positions = np.zeros((len(values), 3))
-    axes, columns = _columns(asf, "t")[0]
-    positions[:, list(axes)] = values[:, columns]
-    return positions
+    sites = {names[bone]: tuple((ends[bone] * scale).tolist()) for bone in leaves}
+    return Skeleton(names, asf.parents, torch.from_numpy(offsets * scale), sites), unit
 
 
 def _quaternions(asf: AsfSkeleton, values: np.ndarray, *, degrees: bool) -> Float[Tensor, "frames joints 4"]:
     """Return the local rotations C R inverse(C), continuous in sign over time."""
-    turns = np.empty((len(values), len(asf.names), 4))
-    for bone, (axes, columns) in enumerate(_columns(asf, "r")):
+    turns = np.empty((len(values), len(asf.bones), 4))
+    for bone, (axes, columns) in enumerate(asf.columns("r")):
         angles = values[:, columns[::-1]]
         # About fixed axes the first named rotation comes first; about moving ones, last.
         turns[:, bone] = euler.to_quat_xyzw(np.deg2rad(angles) if degrees else angles, axes[::-1])
-    frame = torch.from_numpy(asf.axis_quat_xyzw).expand(len(values), -1, 4)
+    frame = torch.from_numpy(np.array([bone.axis_quat_xyzw for bone in asf.bones])).expand(len(values), -1, 4)
     about = rotations.multiply(rotations.multiply(frame, torch.from_numpy(turns)), rotations.inverse(frame))
     return rotations.make_sign_continuous(about)
 
@@ -219,15 +211,6 @@ def rows(text: str) -> Iterator[Row]:
 
 
 _BLANKS = str.maketrans(",()", "   ")
-
-
-@dataclass(frozen=True)
-class _Bone:
-    name: str
-    line: int
-    end: np.ndarray
-    axis: np.ndarray
-    channels: tuple[str, ...]
 
 
 class _AsfReader:
@@ -259,7 +242,7 @@ class _AsfReader:
         )
         axis = self._fixed_axes_quat(angles, words[-1], line)
         channels = self._channels(root["order"], allowed="tr")
-        bones = [_Bone("root", sections[":root"][0][0], np.zeros(3), axis, channels)]
+        bones = [Bone("root", sections[":root"][0][0], np.zeros(3), axis, channels)]
         begun: list[Row] = []
         for line, words in sections[":bonedata"]:
             key = words[0].lower()
@@ -276,13 +259,9 @@ class _AsfReader:
             self.fail(f"the bone of line {begun[0][0]} has no end", begun[-1][0])
         order, parents = self._tree(bones, sections[":hierarchy"])
         index_of = {bone: number for number, bone in enumerate(order)}
-        kept = [bones[bone] for bone in order]
         return AsfSkeleton(
-            names=tuple(bone.name for bone in kept),
+            bones=tuple(bones[bone] for bone in order),
             parents=tuple(index_of[parents[bone]] if bone else -1 for bone in order),
-            ends=np.array([bone.end for bone in kept]),
-            axis_quat_xyzw=np.array([bone.axis for bone in kept]),
-            channels=tuple(bone.channels for bone in kept),
             root_position=np.array(position),
             length=self.length,
             degrees=self.degrees,
@@ -319,7 +298,7 @@ class _AsfReader:
                 found[key] = line, words
         return found
 
-    def _bone(self, section: Sequence[Row], end: int) -> _Bone:
+    def _bone(self, section: Sequence[Row], end: int) -> Bone:
         """Read what is between begin and end; masses and limits are passed over."""
         found, begun = self._rows(section), section[0][0]
         lacks = [key for key in ("name", "direction", "length") if key not in found]
@@ -335,9 +314,9 @@ class _AsfReader:
             line, angles = found["axis"]
             axis = self._fixed_axes_quat(self._numbers((line, angles[:4]), 3), " ".join(angles[4:]), line)
         channels = self._channels(found["dof"], allowed="r") if "dof" in found else ()
-        return _Bone(found["name"][1][1], begun, direction * length, axis, channels)
+        return Bone(found["name"][1][1], begun, direction * length, axis, channels)
 
-    def _tree(self, bones: Sequence[_Bone], section: Sequence[Row]) -> tuple[list[int], dict[int, int]]:
+    def _tree(self, bones: Sequence[Bone], section: Sequence[Row]) -> tuple[list[int], dict[int, int]]:
         """Sort bones depth first in file order; also return the parent of each. The numbers are those of `bones`.
 
         Files are not strict about the case of names.
@@ -398,18 +377,21 @@ class _AsfReader:
         return [value for value in values if value is not None]
 
 
-def read_amc(path: str | PathLike[str], skeleton: AsfSkeleton, *, lossy: bool = False) -> AmcText:
-    """Read a take of the skeleton. FileFormatError names the line and what was expected there.
+def read_amc(
+    path: str | PathLike[str], skeleton: AsfSkeleton, *, lossy: bool
+) -> tuple[np.ndarray, bool, Fraction | None]:
+    """Read a take of the skeleton: values (frames, channels) in the order of its bones and channels, file units;
+    whether angles are in degrees; frames per second, None where the file does not state them, as most do not.
 
-    A `lossy` one may hold NaN among its values, but not only NaN.
+    FileFormatError names the line and what was expected there. A `lossy` take may hold NaN among its values.
     """
 
     def fail(message: str, line: int) -> NoReturn:
         raise FileFormatError(path, message, line)
 
-    counts = [len(channels) for channels in skeleton.channels]
+    counts = [len(bone.channels) for bone in skeleton.bones]
     starts = np.cumsum([0, *counts])[:-1].tolist()
-    bones = {name.lower(): bone for bone, name in enumerate(skeleton.names)}
+    bones = {bone.name.lower(): number for number, bone in enumerate(skeleton.bones)}
     row, values = array("d", bytes(8 * sum(counts))), array("d")
     degrees, fps, full = None, None, False
     frames, number, begun, line = 0, 0, 0, 1
@@ -419,7 +401,7 @@ def read_amc(path: str | PathLike[str], skeleton: AsfSkeleton, *, lossy: bool = 
         if 0 not in seen:
             fail(f"frame {number} has no line for the root", begun)
         if full and seen != expected:
-            bone = shorten(skeleton.names[min(seen ^ expected)])
+            bone = shorten(skeleton.bones[min(seen ^ expected)].name)
             fail(f"not every frame up to {number} holds {bone}, but the file is declared fully specified", begun)
         values.extend(row)
 
@@ -464,7 +446,7 @@ def read_amc(path: str | PathLike[str], skeleton: AsfSkeleton, *, lossy: bool = 
                 value = nan if lossy and missing.is_nan(text) else finite_number(text)
                 if value is None:
                     got = f"{shorten(text)}{missing.missing_hint(text)}"
-                    fail(f"{shown} {skeleton.channels[bone][channel]}: expected {NUMBER}, got {got}", line)
+                    fail(f"{shown} {skeleton.bones[bone].channels[channel]}: expected {NUMBER}, got {got}", line)
                 row[starts[bone] + channel] = value
             seen.add(bone)
     if not frames:
@@ -472,4 +454,5 @@ def read_amc(path: str | PathLike[str], skeleton: AsfSkeleton, *, lossy: bool = 
     expected = expected or seen
     keep_frame()
     rate = None if fps is None else Fraction(fps).limit_denominator(100_000)
-    return AmcText(np.frombuffer(values).reshape(frames, len(row)), degrees, rate)
+    table = np.frombuffer(values).reshape(frames, len(row))
+    return table, skeleton.degrees if degrees is None else degrees, rate

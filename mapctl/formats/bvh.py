@@ -27,6 +27,7 @@ from mapctl.errors import FileFormatError, RequestError
 from mapctl.formats import euler, missing
 from mapctl.formats.atomic import write_bytes
 from mapctl.formats.missing import MissingValues
+from mapctl.formats.parts import make_unique
 from mapctl.formats.text import (
     LARGEST_VALUE,
     NUMBER,
@@ -51,7 +52,6 @@ AXES = {"X": 0, "Y": 1, "Z": 2}
 
 _WORD = re.compile(r"\s*+([{}]|[^\s{}]++)")
 _NAME = re.compile(r"\s*+([^\n{}]*+)")
-_JOINT_LINE = re.compile(r"^[ \t]*(?:ROOT|JOINT)[ \t]+([^\n{}]+)", re.IGNORECASE | re.MULTILINE)
 _CHANNEL = re.compile(r"([XYZ])(position|rotation)", re.IGNORECASE)
 
 Offset = tuple[float, float, float]
@@ -137,13 +137,16 @@ class Hierarchy:
         joints = self._columns()
         return [{AXES[c[0]]: column for c, column in joint if c.endswith("position")} for joint in joints]
 
+    def rotation_columns(self) -> list[tuple[tuple[int, ...], list[int]]]:
+        """Return by joint its Euler order, as axes, and the columns of its angles."""
+        turns = [[(AXES[c[0]], column) for c, column in joint if c.endswith("rotation")] for joint in self._columns()]
+        return [(tuple(axis for axis, _ in joint), [column for _, column in joint]) for joint in turns]
+
     def rotation_groups(self) -> list[tuple[tuple[int, ...], list[int], np.ndarray]]:
         """Group joints by Euler order, to be converted together: axes, joints, and columns (joints, axes)."""
         groups: dict[tuple[int, ...], dict[int, list[int]]] = {}
-        for joint, channels in enumerate(self._columns()):
-            turns = [(AXES[c[0]], column) for c, column in channels if c.endswith("rotation")]
-            axes = tuple(axis for axis, _ in turns)
-            groups.setdefault(axes, {})[joint] = [column for _, column in turns]
+        for joint, (axes, columns) in enumerate(self.rotation_columns()):
+            groups.setdefault(axes, {})[joint] = columns
         return [(axes, list(g), np.array(list(g.values()), dtype=int)) for axes, g in groups.items()]
 
     def _columns(self) -> list[list[tuple[str, int]]]:
@@ -170,10 +173,8 @@ class _Node:
 def read_hierarchy(scanner: Scanner) -> Hierarchy:
     """Read from HIERARCHY to the word MOTION, which is taken too."""
     scanner.expect("HIERARCHY")
-    joints: dict[str, _Node] = {}
+    joints, opened = list[_Node](), list[_Node]()
     ends: dict[int, _Node] = {}
-    opened: list[_Node] = []
-    renamed: list[str] = []
     while (word := scanner.word().upper()) != "MOTION":
         if word not in ("ROOT", "JOINT", "END", "OFFSET", "CHANNELS", "}"):
             allowed = "OFFSET, CHANNELS, JOINT, End Site or '}'" if opened else "ROOT or MOTION"
@@ -181,7 +182,7 @@ def read_hierarchy(scanner: Scanner) -> Hierarchy:
         if word == "ROOT":
             if joints:
                 scanner.fail("a second ROOT, allowed is one")
-            opened.append(_open_joint(scanner, joints, -1, renamed))
+            opened.append(_open_joint(scanner, joints, -1))
             continue
         if not opened:
             scanner.fail(f"{word} outside of a joint, expected ROOT or MOTION")
@@ -189,7 +190,7 @@ def read_hierarchy(scanner: Scanner) -> Hierarchy:
         if word == "JOINT":
             if node.is_end:
                 scanner.fail("a JOINT within an End Site, expected OFFSET or '}'")
-            opened.append(_open_joint(scanner, joints, node.number, renamed))
+            opened.append(_open_joint(scanner, joints, node.number))
         elif word == "END":
             if node.is_end or node.number in ends:
                 scanner.fail(f"a second End Site in {node}")
@@ -212,31 +213,32 @@ def read_hierarchy(scanner: Scanner) -> Hierarchy:
     if opened or not joints:
         lacks = f"'}}' before MOTION: {opened[-1]} is still open" if opened else "ROOT before MOTION"
         scanner.fail(f"expected {lacks}")
+    names = make_unique([node.name for node in joints])
+    renamed = [
+        f"the joint {shorten(node.name)} of line {node.line} as {name!r}"
+        for node, name in zip(joints, names, strict=True)
+        if name != node.name
+    ]
     if renamed:
         more = f" and {len(renamed) - 3} more" if len(renamed) > 3 else ""
         warn_once(f"{scanner.path}: names must be unique, so it reads {', '.join(renamed[:3])}{more}")
     return Hierarchy(
-        names=tuple(joints),
-        parents=tuple(node.parent for node in joints.values()),
-        offsets=tuple(node.offset or _ORIGIN for node in joints.values()),
-        channels=tuple(node.channels or () for node in joints.values()),
+        names=tuple(names),
+        parents=tuple(node.parent for node in joints),
+        offsets=tuple(node.offset or _ORIGIN for node in joints),
+        channels=tuple(node.channels or () for node in joints),
         end_offsets={joint: node.offset or _ORIGIN for joint, node in ends.items()},
     )
 
 
-def _open_joint(scanner: Scanner, joints: dict[str, _Node], parent: int, renamed: list[str]) -> _Node:
-    """Read a joint's name and brace. One whose name is taken gets one that no joint of the file has: `Bip01_2` for the
-    second Bip01."""
-    own = name = scanner.name()
+def _open_joint(scanner: Scanner, joints: list[_Node], parent: int) -> _Node:
+    """Read a joint's name and brace."""
+    name = scanner.name()
     if len(joints) == MAX_JOINTS:
         scanner.fail(f"more than {MAX_JOINTS} joints, which is the most allowed")
-    if name in joints:
-        taken = {line.strip() for line in _JOINT_LINE.findall(scanner.text)} | set(joints)
-        own = next(own for number in count(2) if (own := f"{name}_{number}") not in taken)
-        renamed.append(f"the joint {shorten(name)} of line {scanner.line} as {own!r}")
-    joints[own] = _Node(own, len(joints), parent, scanner.line)
+    joints.append(_Node(name, len(joints), parent, scanner.line))
     scanner.expect("{")
-    return joints[own]
+    return joints[-1]
 
 
 def _read_channels(scanner: Scanner, node: _Node) -> tuple[str, ...]:
@@ -627,23 +629,18 @@ def _keep_source_values(
     turns, positions = as_array(before.local_quat_xyzw), all_translations(before) / layout.metres_per_unit
     turned = (turns == quat_xyzw).all(-1) | (turns == -quat_xyzw).all(-1)
     there = np.all(np.isclose(positions, translations, rtol=1e-12, atol=1e-12), axis=-1)
-    same = [now == then for now, then in zip(tree.channels, old.channels, strict=True)]
-    for joint, (now, then) in enumerate(zip(tree.position_columns(), old.position_columns(), strict=True)):
-        if same[joint]:
-            at, numbers = list(now.values()), own[:, list(then.values())]
-            kept = there[:, joint] & np.isfinite(numbers).all(-1)
-            values[:, at] = np.where(kept[:, None], numbers, values[:, at])
-    read = {
-        joint: columns
-        for _, joints, group in old.rotation_groups()
-        for joint, columns in zip(joints, group, strict=True)
-    }
-    for axes, joints, group in tree.rotation_groups():
-        for joint, at in zip(joints, group, strict=True):
-            if same[joint] and turned[:, joint].any():
-                numbers = own[:, read[joint]]
-                kept = turned[:, joint] & np.isfinite(numbers).all(-1)
-                values[:, at] = euler.keep_source_angles(values[:, at], numbers, kept, axes)
+    now, then = ((t.channels, t.position_columns(), t.rotation_columns()) for t in (tree, old))
+    for joint, (channels, position, (axes, at)) in enumerate(zip(*now, strict=True)):
+        if channels != then[0][joint]:
+            continue
+        numbers = own[:, list(then[1][joint].values())]
+        kept = there[:, joint] & np.isfinite(numbers).all(-1)
+        columns = list(position.values())
+        values[:, columns] = np.where(kept[:, None], numbers, values[:, columns])
+        numbers = own[:, then[2][joint][1]]
+        kept = turned[:, joint] & np.isfinite(numbers).all(-1)
+        if kept.any():
+            values[:, at] = euler.keep_source_angles(values[:, at], numbers, kept, axes)
     return values
 
 

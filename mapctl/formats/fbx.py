@@ -4,7 +4,6 @@
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +15,13 @@ from mapctl.formats.parts import (
     GREY,
     MAX_CORNERS,
     MAX_JOINTS,
+    Armature,
     FoundCharacter,
     MeshPart,
     Poses,
     check_poses,
     check_size,
+    choose_armature,
     complete_bind_pose,
     decode_picture,
     decode_srgb,
@@ -58,14 +59,12 @@ def find_character(path: str, *, armature: str | None, animation: str | None, wa
     The rest pose is the one in which skins are bound where bones are as long as the nodes', else the nodes'.
     """
     scene, fault = open_scene(path, with_mesh=wanted == "mesh")
-    armatures = find_armatures(scene)
-    listed = [one.name for one in armatures]
-    own = armatures[find_name(Path(path).name, listed, armature, "armature")]
+    listed, own = choose_armature(path, find_armatures(scene), armature)
     root, names = own.nodes[0], make_unique([node.name or f"node_{node.typed_id}" for node in own.nodes])
     worlds = np.stack([to_matrix(node.node_to_world) for node in own.nodes])
     bound = _read_bind_poses(scene, own)
     check_size(worlds, *(matrix for pose in bound for matrix in pose.values()))
-    complete = (complete_bind_pose(own.parents, pose, worlds) for pose in bound)
+    complete = complete_bind_pose(own.parents, bound, worlds)
     found = FoundCharacter(
         armature=own.name,
         armatures=listed,
@@ -73,7 +72,7 @@ def find_character(path: str, *, armature: str | None, animation: str | None, wa
         nodes=names,
         parents=own.parents,
         metres_per_unit=scene.settings.original_unit_meters,
-        worlds=next((pose for pose in complete if pose is not None), worlds),
+        worlds=worlds if complete is None else complete,
         outer=np.eye(4) if root.is_root else to_matrix(above(root).node_to_world),
         ends={joint: to_matrix(node.node_to_parent)[:, 3:] for joint, node in own.ends.items()},
         fault=fault,
@@ -182,31 +181,15 @@ def to_matrix(columns: ufbx.Matrix) -> Array:
     return matrix
 
 
-@dataclass(frozen=True, eq=False)
-class Armature:
-    """The tree of one character's joints."""
-
-    name: str
-    """Name by which it is chosen: of the node above its root, else of the root."""
-    nodes: list[ufbx.Node]
-    """Joints, parents first; the first is the root."""
-    parents: tuple[int, ...]
-    """Index of each one's parent, -1 for the root."""
-    ends: dict[int, ufbx.Node]
-    """Node that is the End Site of a last joint, by that joint's index."""
-
-
-def find_armatures(scene: ufbx.Scene) -> list[Armature]:
+def find_armatures(scene: ufbx.Scene) -> list[Armature[ufbx.Node]]:
     """Find the armatures of a file, in its order. Refusal where it has none."""
     bones = _find_bones(scene)
     if not bones:
         raise Refusal("has no limb nodes and no skin, so nothing in it marks nodes as a character's joints")
-    found = [_build(scene, group, bones) for group in _group(scene, bones)]
-    names = make_unique([armature.name for armature in found])
-    return [replace(armature, name=name) for name, armature in zip(names, found, strict=True)]
+    return [_build(scene, group, bones) for group in _group(scene, bones)]
 
 
-def _read_bind_poses(scene: ufbx.Scene, armature: Armature) -> list[dict[int, Array]]:
+def _read_bind_poses(scene: ufbx.Scene, armature: Armature[ufbx.Node]) -> list[dict[int, Array]]:
     """Return world matrices (4, 4) by joint of the bind poses of the file: by its skins, and by
     its bind poses."""
     index_of = {node.typed_id: joint for joint, node in enumerate(armature.nodes)}
@@ -259,7 +242,7 @@ def _group(scene: ufbx.Scene, bones: dict[int, ufbx.Node]) -> list[list[ufbx.Nod
     return [[top for top, own in zip(tops, group, strict=True) if own == one] for one in dict.fromkeys(group)]
 
 
-def _build(scene: ufbx.Scene, tops: list[ufbx.Node], bones: dict[int, ufbx.Node]) -> Armature:
+def _build(scene: ufbx.Scene, tops: list[ufbx.Node], bones: dict[int, ufbx.Node]) -> Armature[ufbx.Node]:
     root = tops[0]
     if len(tops) > 1:  # their deepest common node
         root = scene.root_node
@@ -294,7 +277,7 @@ def _list_takes(scene: ufbx.Scene) -> dict[str, ufbx.AnimStack]:
     return dict(zip(make_unique([stack.name or f"take_{k}" for k, stack in enumerate(stacks)]), stacks, strict=True))
 
 
-def _name_takes(scene: ufbx.Scene, armature: Armature) -> dict[str, tuple[ufbx.AnimStack, float, float]]:
+def _name_takes(scene: ufbx.Scene, armature: Armature[ufbx.Node]) -> dict[str, tuple[ufbx.AnimStack, float, float]]:
     """Return the animations that move the armature or what is above it, with their first and last second, by name."""
     own = {node.element_id for node in [*armature.nodes, *line_of(armature.nodes[0])]}
     takes = _list_takes(scene).items()
@@ -311,7 +294,9 @@ def _moved_nodes(stack: ufbx.AnimStack) -> set[int]:
     }
 
 
-def _sample(scene: ufbx.Scene, name: str, stack: ufbx.AnimStack, begin: float, end: float, armature: Armature) -> Poses:
+def _sample(
+    scene: ufbx.Scene, name: str, stack: ufbx.AnimStack, begin: float, end: float, armature: Armature[ufbx.Node]
+) -> Poses:
     outer = line_of(armature.nodes[0])[:0:-1]
     rate = scene.settings.frames_per_second
     rate = rate if np.isfinite(rate) and 0.01 <= rate <= 1e5 else _USUAL_RATE
@@ -356,7 +341,7 @@ def _sample_node(anim: ufbx.Anim, node: ufbx.Node, times: Array, moved: set[int]
     return table if len(table) == len(times) else np.tile(table, (len(times), 1))
 
 
-def _read_parts(scene: ufbx.Scene, armature: Armature, folder: Path) -> list[MeshPart]:
+def _read_parts(scene: ufbx.Scene, armature: Armature[ufbx.Node], folder: Path) -> list[MeshPart]:
     """Read what the armature's skins carry, and what hangs on its joints rigidly; pictures lie in `folder` or below."""
     index_of = {node.typed_id: joint for joint, node in enumerate(armature.nodes)}
     found = []
@@ -371,7 +356,7 @@ def _read_parts(scene: ufbx.Scene, armature: Armature, folder: Path) -> list[Mes
 
 
 def _read_carriers(
-    mesh: ufbx.Mesh, node: ufbx.Node, index_of: dict[int, int], armature: Armature
+    mesh: ufbx.Mesh, node: ufbx.Node, index_of: dict[int, int], armature: Armature[ufbx.Node]
 ) -> tuple[Array, Array, Array, Array] | None:
     """Return joints (m,) and matrices (m, 4, 4) from the mesh to their frames, and by vertex indices among them (n, k)
     and their shares; None where the armature does not carry the mesh."""

@@ -14,7 +14,7 @@ import json
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 from os import PathLike
@@ -32,10 +32,12 @@ from mapctl.formats.bvh import check_finite
 from mapctl.formats.character import CharacterSource, build_skinned_body, character_of, compose_matrices, sample_times
 from mapctl.formats.parts import (
     MAX_JOINTS,
+    Armature,
     FoundCharacter,
     MeshPart,
     chain_matrices,
     check_poses,
+    choose_armature,
     complete_bind_pose,
     decode_picture,
     decode_srgb,
@@ -98,9 +100,7 @@ def read_character(path: Path, *, armature: str | None, animation: str | None, w
     nodes' (VRM files: always the nodes'); else the nodes'.
     """
     gltf = read_file(path)
-    armatures = find_armatures(gltf)
-    listed = [one.name for one in armatures]
-    own = armatures[find_name(path.name, listed, armature, "armature")]
+    listed, own = choose_armature(path, find_armatures(gltf), armature)
     nodes = [gltf.get("nodes", node) for node in own.nodes]
     outer = gltf.chain(gltf.line(own.nodes[0])[1:])
     worlds = chain_matrices(own.parents, np.stack([_node_matrix(node) for node in nodes]), outer)
@@ -134,7 +134,7 @@ def _name_bones(gltf: "Gltf", names: Mapping[int, str]) -> dict[str, str]:
     return {bone: name for bone, name in bones.items() if bone in CANONICAL.names}
 
 
-def _read_motion(gltf: "Gltf", armature: "Armature", wanted: str | None, found: FoundCharacter) -> None:
+def _read_motion(gltf: "Gltf", armature: Armature[int], wanted: str | None, found: FoundCharacter) -> None:
     """Add the wanted animation, else the first that moves the armature, to what was found."""
     names = _name_animations(gltf)
     numbers = range(len(names)) if wanted is None else [find_name("", names, wanted, "animation")]
@@ -370,23 +370,7 @@ def _read_table(gltf: Gltf, entry: Json, shape: tuple[int, int], dtype: np.dtype
     return np.ndarray(shape, dtype, data, offset, (stride, dtype.itemsize))
 
 
-@dataclass(frozen=True, eq=False)
-class Armature:
-    """A connected tree of nodes that are one character's joints."""
-
-    name: str
-    """Name by which it is chosen."""
-    nodes: tuple[int, ...]
-    """Its nodes, parents first; the first is the root."""
-    parents: tuple[int, ...]
-    """Index among `nodes` of each one's parent, -1 for the root."""
-    skins: tuple[int, ...]
-    """Skins that it carries."""
-    ends: dict[int, int]
-    """Node that is the End Site of a last joint, by that joint's index among `nodes`."""
-
-
-def _bind_worlds(gltf: Gltf, armature: Armature, worlds: Array, outer: Array) -> Array | None:
+def _bind_worlds(gltf: Gltf, armature: Armature[int], worlds: Array, outer: Array) -> Array | None:
     """Return world matrices (joints, 4, 4) of the pose in which the skins are bound, as far as they agree with the
     nodes' bones; None where they do not, or are not said.
 
@@ -401,8 +385,7 @@ def _bind_worlds(gltf: Gltf, armature: Armature, worlds: Array, outer: Array) ->
         for node, matrix in zip(gltf.get("skins", number)["joints"], inverse, strict=True):
             bound.setdefault(index_of[node], np.linalg.inv(matrix))  # a ValueError where it is singular
     spaces = ({joint: space @ matrix for joint, matrix in bound.items()} for space in (np.eye(4), outer))
-    complete = (complete_bind_pose(armature.parents, space, worlds) for space in spaces)
-    return next((pose for pose in complete if pose is not None), None)
+    return complete_bind_pose(armature.parents, spaces, worlds)
 
 
 def _read_inverse_binds(gltf: Gltf, skin: int) -> Array | None:
@@ -446,7 +429,7 @@ def read_bones(gltf: Gltf) -> dict[str, int]:
     return {bone["bone"]: bone["node"] for bone in bones}
 
 
-def find_armatures(gltf: Gltf) -> list[Armature]:
+def find_armatures(gltf: Gltf) -> list[Armature[int]]:
     """Find the armatures of a file; Refusal where nothing marks nodes as joints, or they are no tree."""
     skins, groups = gltf.all("skins"), list[tuple[set[int], list[int]]]()
     targets = [c["target"] for animation in gltf.all("animations") for c in animation.get("channels", ())]
@@ -461,9 +444,7 @@ def find_armatures(gltf: Gltf) -> list[Armature]:
         groups = [group for group in groups if group not in near]
         groups.append((joints.union(*(g[0] for g in near)), sorted({number, *(s for g in near for s in g[1])})))
     by_skin = sorted(groups, key=lambda group: group[1])
-    found = [_build_armature(gltf, joints, own, animated) for joints, own in by_skin]
-    names = make_unique([armature.name for armature in found])
-    return [replace(armature, name=name) for name, armature in zip(names, found, strict=True)]
+    return [_build_armature(gltf, joints, own, animated) for joints, own in by_skin]
 
 
 def _share_line(gltf: Gltf, first: set[int], second: set[int]) -> bool:
@@ -490,7 +471,7 @@ def _find_bare_joints(gltf: Gltf, animated: set[int]) -> list[set[int]]:
     return [{n for n in below if n in moved or gltf.get("nodes", n).get("children")} for moved, below in walks]
 
 
-def _build_armature(gltf: Gltf, joints: set[int], skins: list[int], animated: set[int]) -> Armature:
+def _build_armature(gltf: Gltf, joints: set[int], skins: list[int], animated: set[int]) -> Armature[int]:
     """Build the tree of a group's joints; its root is the topmost node above them that any animation moves."""
     nodes, bones = gltf.all("nodes"), set(read_bones(gltf).values())
     own = gltf.connect(joints)
@@ -512,7 +493,7 @@ def _build_armature(gltf: Gltf, joints: set[int], skins: list[int], animated: se
     above = [nodes[k] for k in (gltf.parent.get(order[0]), order[0]) if k is not None]  # exporters name it there
     named = [*(gltf.get("skins", skin) for skin in skins[:1]), *above]
     name = next((str(one["name"]) for one in named if one.get("name")), f"armature_{order[0]}")
-    return Armature(name, tuple(order), parents, tuple(skins), ends)
+    return Armature(name, order, parents, ends, skins)
 
 
 @dataclass(frozen=True, eq=False)
@@ -623,7 +604,7 @@ def _sample_tracks(gltf: Gltf, nodes: Sequence[int], tracks: Sequence[Track]) ->
     return fps, matrices
 
 
-def _read_parts(gltf: Gltf, armature: Armature) -> Iterator[MeshPart]:
+def _read_parts(gltf: Gltf, armature: Armature[int]) -> Iterator[MeshPart]:
     """Read what the armature's skins carry, and what hangs on its joints rigidly."""
     index_of = {node: joint for joint, node in enumerate(armature.nodes)}
     for number, node in enumerate(gltf.all("nodes")):

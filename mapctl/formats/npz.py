@@ -15,7 +15,6 @@ What another format needs to write a file back as it came (`Motion.source`) is n
 """
 
 import io
-import zipfile
 from fractions import Fraction
 from os import PathLike
 
@@ -23,9 +22,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mapctl.errors import FileFormatError, MapctlError, RequestError
+from mapctl.errors import FileFormatError, MapctlError
 from mapctl.formats import missing
 from mapctl.formats.atomic import write_bytes
+from mapctl.formats.bvh import as_array, check_finite
 from mapctl.formats.missing import MissingValues
 from mapctl.formats.text import LARGEST_VALUE, MAX_FILE_BYTES, NUMBER, one_line, read_bytes
 from mapctl.formats.units import FASTEST, SLOWEST
@@ -74,29 +74,26 @@ def read(path: str | PathLike[str], *, lossy: bool) -> tuple[Motion, MissingValu
 
 def save(motion: Motion, path: str | PathLike[str]) -> None:
     """Write the motion under the keys above. Same motion, same bytes. RequestError where it holds a NaN."""
-    arrays = to_arrays(motion)
-    for key, values in arrays.items():
-        if values.dtype.kind == "f" and not np.isfinite(values).all():
-            raise RequestError(f"cannot write {path}: {key} is not finite")
+    check_finite(motion, path)
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    np.savez_compressed(buffer, allow_pickle=False, **to_arrays(motion))
     write_bytes(path, buffer.getvalue())
 
 
 def to_arrays(motion: Motion) -> dict[str, np.ndarray]:
     """Return the arrays of a motion, by the keys above."""
     skeleton, moving = motion.skeleton, sorted(motion.moving_offsets)
-    tracks = np.array([_numbers(motion.moving_offsets[joint]) for joint in moving])
+    tracks = np.array([as_array(motion.moving_offsets[joint]) for joint in moving])
     return {
         "format": np.array(FORMAT),
         "names": np.array(skeleton.names),
         "parents": np.array(skeleton.parents, dtype=np.int64),
-        "offsets": _numbers(skeleton.offsets),
+        "offsets": as_array(skeleton.offsets),
         "end_names": np.array(list(skeleton.end_offsets), dtype=np.str_),
         "end_offsets": np.array(list(skeleton.end_offsets.values()), dtype=np.float64).reshape(-1, 3),
         "fps": np.array([motion.fps.numerator, motion.fps.denominator], dtype=np.int64),
-        "root_position_world": _numbers(motion.root_position),
-        "local_quat_xyzw": _numbers(motion.local_quat_xyzw),
+        "root_position_world": as_array(motion.root_position),
+        "local_quat_xyzw": as_array(motion.local_quat_xyzw),
         "moving_joints": np.array(moving, dtype=np.int64),
         "moving_offsets": tracks.reshape(len(moving), motion.num_frames, 3),
     } | ({_LICENCE: np.array(motion.licence)} if motion.licence else {})
@@ -127,15 +124,13 @@ def _read_arrays(path: str | PathLike[str], raw: bytes) -> dict[str, np.ndarray]
     if not raw.startswith(b"PK\x03\x04"):
         raise FileFormatError(path, "is not an .npz archive")
     try:
-        with zipfile.ZipFile(io.BytesIO(raw)) as archive:
-            sizes = {member.filename.removesuffix(".npy"): member.file_size for member in archive.infolist()}
-            if lacking := _KEYS.keys() - sizes.keys():
-                raise FileFormatError(path, f"lacks the keys {', '.join(key for key in _KEYS if key in lacking)}")
-            if (total := sum(sizes.get(key, 0) for key in (*_KEYS, _LICENCE))) > MAX_FILE_BYTES:
+        with np.load(io.BytesIO(raw), allow_pickle=False) as archive:
+            if lacking := [key for key in _KEYS if key not in archive]:
+                raise FileFormatError(path, f"lacks the keys {', '.join(lacking)}")
+            keys = [key for key in (*_KEYS, _LICENCE) if key in archive]
+            if (total := sum(archive.zip.getinfo(f"{key}.npy").file_size for key in keys)) > MAX_FILE_BYTES:
                 raise FileFormatError(path, f"unpacks to {total >> 20} MiB, allowed are {MAX_FILE_BYTES >> 20}")
-            keys = [*_KEYS, *([_LICENCE] if f"{_LICENCE}.npy" in archive.namelist() else [])]
-            contents = {key: io.BytesIO(archive.read(f"{key}.npy")) for key in keys}
-            return {key: np.lib.format.read_array(content, allow_pickle=False) for key, content in contents.items()}
+            return {key: archive[key] for key in keys}
     except FileFormatError:
         raise
     except Exception as error:  # zipfile and numpy raise whatever a forged archive leads their parsers to
@@ -184,10 +179,6 @@ def _replace_missing(path: str | PathLike[str], arrays: dict[str, np.ndarray]) -
             "root_position_world": missing.interpolate_nan(arrays["root_position_world"], np.zeros(3)),
         }
     return MissingValues(torch.from_numpy(turns.any(axis=-1)), torch.from_numpy(positions))
-
-
-def _numbers(values: Tensor) -> np.ndarray:
-    return values.detach().cpu().double().numpy()
 
 
 def _tensor(values: np.ndarray) -> Tensor:

@@ -5,12 +5,13 @@ What is wrong with a file is a `Refusal`, which `names_file` and `sandbox.call` 
 
 import io
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from os import PathLike
 from pathlib import Path
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from mapctl.formats.sandbox import Refusal
 from mapctl.formats.text import MAX_POSES
 
 Array = np.ndarray
+Node = TypeVar("Node")
 MAX_JOINTS = 4096
 """Most joints of an armature."""
 MAX_CORNERS = 2**25
@@ -88,6 +90,31 @@ def find_name(file: str, names: Sequence[str], wanted: str | None, what: str) ->
     if wanted is None and what == "armature" and len(names) > 1:
         raise Refusal(f"has {len(names)} armatures: {listed}; choose one, as {file}#{names[0]}")
     return 0 if wanted is None else names.index(wanted)
+
+
+@dataclass(frozen=True, eq=False)
+class Armature(Generic[Node]):
+    """A connected tree of nodes that are one character's joints."""
+
+    name: str
+    """Name by which it is chosen."""
+    nodes: Sequence[Node]
+    """Its nodes, parents first; the first is the root."""
+    parents: tuple[int, ...]
+    """Index among `nodes` of each one's parent, -1 for the root."""
+    ends: dict[int, Node]
+    """Node that is the End Site of a last joint, by that joint's index among `nodes`."""
+    skins: Sequence[int] = ()
+    """Skins that it carries, where the format numbers them."""
+
+
+def choose_armature(
+    path: str | PathLike[str], armatures: Sequence[Armature[Node]], wanted: str | None
+) -> tuple[list[str], Armature[Node]]:
+    """Return the armatures' names, unique, and the wanted one, as `find_name` does."""
+    names = make_unique([armature.name for armature in armatures])
+    number = find_name(Path(path).name, names, wanted, "armature")
+    return names, replace(armatures[number], name=names[number])
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,9 +267,16 @@ def nearest_rotations(linear: Array) -> Array:
     return (left * flip[..., None, :]) @ right
 
 
-def complete_bind_pose(parents: Sequence[int], bound: Mapping[int, Array], worlds: Array) -> Array | None:
-    """Complete the world matrices (4, 4) of a bind pose, by joint, with those of the nodes, (joints, 4, 4), for joints
-    that it leaves out; None unless all bones are as long as the nodes', and joints are scaled like them."""
+def complete_bind_pose(
+    parents: Sequence[int], candidates: Iterable[Mapping[int, Array]], worlds: Array
+) -> Array | None:
+    """Return world matrices (joints, 4, 4) of the first candidate, a bind pose of matrices (4, 4) by joint, whose bones
+    are as long as the nodes' and joints scaled like them; joints that it leaves out are as the nodes', (joints, 4, 4).
+    None where there is none."""
+    return next((done for bound in candidates if (done := _complete(parents, bound, worlds)) is not None), None)
+
+
+def _complete(parents: Sequence[int], bound: Mapping[int, Array], worlds: Array) -> Array | None:
     done = np.empty_like(worlds)
     for joint, parent in enumerate(parents):
         above = np.eye(4) if parent < 0 else done[parent]

@@ -54,7 +54,7 @@ def guess_unit(
     lengths = np.linalg.norm(offsets, axis=1)
     lengths[[0, *moving]] = 0.0
     ends = {joint: float(np.linalg.norm(offset)) for joint, offset in end_offsets.items()}
-    size, adult, part = hips_to_toes_length(names, parents, lengths, ends, moving), ADULT_LEG, "legs are"
+    size, adult, part = _hips_to_toes_length(names, parents, lengths, ends, moving), ADULT_LEG, "legs are"
     if size == 0:
         size, adult, part = longest_chain_length(parents, lengths, ends), ADULT_REACH, "the longest chain of bones is"
     if size == 0:
@@ -68,20 +68,24 @@ def guess_unit(
     return FileUnit(UNITS[best], unit_doubt=doubt)
 
 
-def hips_to_toes_length(
+def _hips_to_toes_length(
     names: Sequence[str],
     parents: Sequence[int],
     lengths: np.ndarray,
     ends: Mapping[int, float],
-    moving: Collection[int] = (),
+    moving: Collection[int],
 ) -> float:
     """Return hips to toes along the bones, or to the foot's End Site if there are no toes; 0 if no foot is named."""
-    plain = [_normalise_name(name) for name in names]
-    joint = _first_named(_TOES, plain) or _first_named(_FEET, plain)
+    plain = ["".join(filter(str.isalnum, name.rpartition(":")[2])).lower() for name in names]  # lefttoebase
+
+    def named(joint: int, words: Sequence[str]) -> bool:
+        return any(word in plain[joint] for word in words)
+
+    joint = next((j for words in (_TOES, _FEET) for j in range(len(plain)) if named(j, words)), None)
     if joint is None:
         return 0.0
-    length = 0.0 if _any_in(_TOES, plain[joint]) else ends.get(joint, 0.0)
-    while joint > 0 and joint not in moving and plain[joint] != "hip" and not _any_in(_HIPS, plain[joint]):
+    length = 0.0 if named(joint, _TOES) else ends.get(joint, 0.0)
+    while joint > 0 and joint not in moving and plain[joint] != "hip" and not named(joint, _HIPS):
         length, joint = length + float(lengths[joint]), parents[joint]
     return length
 
@@ -92,19 +96,6 @@ def longest_chain_length(parents: Sequence[int], lengths: np.ndarray, ends: Mapp
     for joint in range(1, len(parents)):
         distance[joint] = distance[parents[joint]] + lengths[joint]
     return float(max(distance[joint] + ends.get(joint, 0.0) for joint in range(len(parents))))
-
-
-def _normalise_name(name: str) -> str:
-    """Normalise a name: `mixamorig:LeftToe_Base` is `lefttoebase`."""
-    return "".join(filter(str.isalnum, name.rpartition(":")[2])).lower()
-
-
-def _first_named(words: Sequence[str], names: Sequence[str]) -> int | None:
-    return next((joint for joint, name in enumerate(names) if _any_in(words, name)), None)
-
-
-def _any_in(words: Sequence[str], name: str) -> bool:
-    return any(word in name for word in words)
 
 
 SHORTEST_FRAME, LONGEST_FRAME = 1e-5, 100.0

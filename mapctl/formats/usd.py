@@ -126,10 +126,9 @@ def _place_rest(skeleton: "SkeletonPrim", outer: Array, stage: Array) -> Array:
     worlds = chain_matrices(parents, rest, outer)
     if bind is None:
         return worlds
-    for space in (outer, stage):
-        found = complete_bind_pose(parents, dict(enumerate(space @ bind)), worlds)
-        if found is not None:
-            return found
+    found = complete_bind_pose(parents, (dict(enumerate(space @ bind)) for space in (outer, stage)), worlds)
+    if found is not None:
+        return found
     try:
         split_scales(parents, outer @ bind)
     except UnevenScaleError:

@@ -87,27 +87,23 @@ class Mannequin:
         """Positions (frames, n, 3) of hips and all below, metres, without a root on the floor."""
         return self.anatomy.seen
 
-    def boxes(self, frame: int) -> list[RoundedBoxes]:
-        """Return limbs and trunk, skull and shoes in one frame."""
-        feet = [_shoe(self.anatomy, foot, frame) for foot in self.anatomy.feet]
-        head = self.anatomy.find(Part.HEAD)
-        skull = [] if head is None else [_skull(self.anatomy, head, frame, self.colour)]
-        return [self._capsules(frame), *skull, *feet]
-
-    def joints(self) -> list[Array]:
-        """Return for each of `boxes` the joints that carry its parts."""
-        anatomy = self.anatomy
-        head = anatomy.find(Part.HEAD)
-        skull = [] if head is None else [np.array([head, head])]
-        toes = [foot.ball if foot.ball < anatomy.joints else foot.ankle for foot in anatomy.feet]
-        shoes = [np.array([foot.ankle, toe][: len(foot.bones)]) for foot, toe in zip(anatomy.feet, toes, strict=True)]
-        return [self.bones.ends[:, 0], *skull, *shoes]
+    def boxes(self, frame: int) -> tuple[RoundedBoxes, Array]:
+        """Return limbs and trunk, skull and shoes in one frame, and the joints (parts,) that carry them."""
+        anatomy, head = self.anatomy, self.anatomy.find(Part.HEAD)
+        found = [(self._capsules(frame), self.bones.ends[:, 0])]
+        if head is not None:
+            found.append((_skull(anatomy, head, frame, self.colour), np.array([head, head])))
+        for foot in anatomy.feet:
+            toe = foot.ball if foot.ball < anatomy.joints else foot.ankle
+            found.append((_shoe(anatomy, foot, frame), np.array([foot.ankle, toe][: len(foot.bones)])))
+        boxes, joints = zip(*found, strict=True)
+        names = ("centre", "frame", "half", "radius", "squash", "rgb")
+        whole = RoundedBoxes(*(np.concatenate([getattr(box, name) for box in boxes]) for name in names))
+        return whole, np.concatenate(joints)
 
     def surface(self, frame: int) -> Surface:
         """Return the whole body in one frame."""
-        boxes = self.boxes(frame)
-        names = ("centre", "frame", "half", "radius", "squash", "rgb")
-        return RoundedBoxes(*(np.concatenate([getattr(box, name) for box in boxes]) for name in names)).surface()
+        return self.boxes(frame)[0].surface()
 
     def sticks(self, frame: int) -> tuple[Array, Array, Array]:
         """Return all bones with those of head and feet: ends (n, 2, 3) and radii (n,) in metres, colours (n, 3)."""
@@ -312,11 +308,9 @@ def build_skin(motion: Motion, colour: str = "slate") -> CharacterMesh:
     `colour` is the torso's: a name of `colours.ACTORS` or `#rrggbb`; RequestError otherwise.
     """
     body = Mannequin(motion, colours.rgb(colour))
-    surfaces = [box.surface() for box in body.boxes(0)]
-    joint = np.concatenate(
-        [np.repeat(own, len(s.vertices) // len(own)) for own, s in zip(body.joints(), surfaces, strict=True)]
-    )
-    whole = body.surface(0)
+    boxes, joints = body.boxes(0)
+    whole = boxes.surface()
+    joint = np.repeat(joints, len(whole.vertices) // len(joints))
     assert whole.normals is not None, "boxes are lit"
     turn = body.anatomy.rotations[0, joint]
     rest = place_at_rest(motion.skeleton)
