@@ -101,8 +101,8 @@ def list_layers(ground: Sequence[Surface], bodies: Sequence[Surface], eye: Array
     Sheer is the ground, and over it the triangles of bodies that are not opaque, the furthest first.
     """
     layers: dict[Layer, list[Surface]] = {layer: [] for layer in Layer}
-    layers[Layer.SHEER] += [_shade_flat(surface, eye) for surface in ground]
-    for body in (_shade_flat(one, eye) for one in bodies):
+    layers[Layer.SHEER] += [shade(surface, eye) for surface in ground]
+    for body in (shade(one, eye) for one in bodies):
         # Vertices of opaque triangles have no opacity, by which a mesh as a whole would count as seen through.
         solid = replace(body, rgba=np.column_stack([body.rgba[:, :3], np.ones(len(body.rgba))]))
         is_sheer = (body.rgba[body.faces, 3] < _OPAQUE).any(axis=1)
@@ -115,15 +115,10 @@ def list_layers(ground: Sequence[Surface], bodies: Sequence[Surface], eye: Array
     return {layer: surface for layer, surface in merged.items() if len(surface.faces)}
 
 
-def _shade_flat(surface: Surface, eye: Array) -> Surface:
-    """Put the light into the colours of the vertices."""
-    return replace(surface, rgba=shade(surface, eye), normals=None)
-
-
-def shade(surface: Surface, eye: Array) -> Array:
-    """Return (n, 4) sRGB of a lit surface as seen from `eye` (3,); a flat one keeps its colours."""
+def shade(surface: Surface, eye: Array) -> Surface:
+    """Put the light into the colours (n, 4) of a lit surface as seen from `eye` (3,); a flat one keeps its colours."""
     if surface.normals is None:
-        return surface.rgba
+        return surface
     normals, to_eye = surface.normals, unit(eye - surface.vertices)
     towards_lamp = -LIGHT
     facing = normals @ towards_lamp
@@ -134,7 +129,8 @@ def shade(surface: Surface, eye: Array) -> Array:
     shine = _HIGHLIGHT * np.clip(np.einsum("ij,ij->i", normals, halfway), 0, None) ** _SHARPNESS * (facing > 0)
     rim = _RIM * (1 - np.clip(np.einsum("ij,ij->i", normals, to_eye), 0, 1)) ** 3 * sky[:, 0]
     linear = surface.rgba[:, :3] ** _GAMMA * light + (shine + rim)[:, None]
-    return np.column_stack([np.clip(linear, 0, 1) ** (1 / _GAMMA), surface.rgba[:, 3]])
+    rgba = np.column_stack([np.clip(linear, 0, 1) ** (1 / _GAMMA), surface.rgba[:, 3]])
+    return replace(surface, rgba=rgba, normals=None)
 
 
 NEEDS_NO_SCREEN = sys.platform == "linux"

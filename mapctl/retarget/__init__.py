@@ -151,12 +151,9 @@ def to_canonical(motion: Motion, rig: Rig | RigMap | None = None) -> tuple[Motio
             picked.append(rotations.multiply(world[:, joint], rotations.inverse(tpose).expand(len(world), 4)))
     local = kinematics.local_from_world(CANONICAL.parents, torch.stack(picked, dim=1))
     hips = motion.joint_positions()[:, rigmap.joints["hips"]]
-    upright = rigmap.upright_quat_xyzw
-    if upright is not None:  # all other joints rotate with the hips
-        local[:, 0] = rotations.multiply(upright.expand(len(world), 4), local[:, 0])
-        hips = rotations.rotate(upright.expand(len(world), 4), hips)
-    quats = rotations.make_sign_continuous(local)
-    return Motion(rigmap.skeleton, motion.fps, hips, quats, licence=motion.licence), rigmap
+    found = Motion(rigmap.skeleton, motion.fps, hips, local, licence=motion.licence)
+    found = rotate_world(found, rigmap.upright_quat_xyzw)
+    return replace(found, local_quat_xyzw=rotations.make_sign_continuous(found.local_quat_xyzw)), rigmap
 
 
 def rig_joint_positions(motion: Motion, rigmap: RigMap) -> Float[Tensor, "frames joints 3"]:

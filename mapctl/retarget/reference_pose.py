@@ -101,7 +101,8 @@ def find_tpose(
     readings: list[tuple[Tensor, Tensor, str]] = []
     laid_out = _lay_out_tpose(zero, front) if rest != "neither" or rig.rest == "straighten" else None
     # A preset's table is of files as its program writes them; one whose rest pose is another has other joint frames.
-    if rig.has_tpose and (stated or rest == "neither" or is_canonical_tpose(zero)):
+    has_table = rig.rest == "tpose" or (rig.rest == "auto" and bool(rig.tpose))
+    if has_table and (stated or rest == "neither" or is_canonical_tpose(zero)):
         # Joints that the table leaves out are as in the rest pose, or unrotated where that is to be the T-pose or none.
         known = None if rig.rest == "tpose" else laid_out
         quats = UNROTATED.repeat(CANONICAL.num_joints, 1) if known is None else known.clone()

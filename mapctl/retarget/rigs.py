@@ -70,11 +70,6 @@ class Rig(_RigSettings):
             near = describe_nearest(strange[0], CANONICAL.names)
             raise RequestError(f"rig {self.name}: no canonical joint {shorten(strange[0])}; {near}")
 
-    @property
-    def has_tpose(self) -> bool:
-        """Whether the T-pose is given, so that it need not be found."""
-        return bool(self.tpose or self.rest == "tpose") and self.rest in ("auto", "tpose")
-
     def with_fields_of(self, other: "Rig") -> "Rig":
         """Return the rig with up axis, facing, rest pose and unit of another one, where that one has them."""
         own = {name: getattr(other, name) for name in ("up", "facing", "rest", "metres_per_unit")}

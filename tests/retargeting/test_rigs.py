@@ -217,26 +217,20 @@ def test_the_static_root_of_an_original_stays():
 @pytest.mark.parametrize(("preset", "version", "arms"), [(*tree, 40 * (k % 2)) for k, tree in enumerate(TREES)])
 def test_a_rig_as_a_program_writes_it_is_known_and_comes_back(preset, version, arms):
     rig_request = replace(TREES[preset, version], arms_down_deg=arms, extras=False)
-    result, wanted = make(rig_request), person(1.0, 30)
-    motion = result.motion(wanted)
-    canonical, rigmap = retarget.to_canonical(motion)
+    result, wanted, motion, canonical, rigmap = converted(rig_request, frames=30)
     absent = CANONICAL.num_joints - len(result.joint)
     assert rigmap.rig.name == preset
     assert rigmap.match.score == pytest.approx(1.0 - 0.6 * absent / CANONICAL.num_joints)
-    assert rigmap.joint_names == dict(result.joint)
     assert (rigmap.rest, rigmap.up) == ("T" if arms == 0 else "A", "z" if rig_request.zup else "y")
     facing = {(False, 0): "z", (False, 180): "-z", (True, 0): "-y"}[rig_request.zup, rig_request.turned_deg]
     assert rigmap.facing == facing
     assert assess_fit(rigmap, motion).doubts == ()
-    known = [CANONICAL.index(name) for name in result.joint]
-    turned = turn_between(canonical.joint_rotations()[:, known], wanted.joint_rotations()[:, known])
-    assert np.rad2deg(turned) < 0.01
+    assert_understood(result, wanted, canonical, rigmap, degrees=0.01)
     # Twists in the chain move no joint of a limb: hands and feet are where they are in truth.
+    known = [CANONICAL.index(name) for name in result.joint]
     positions = canonical.joint_positions()[:, known], wanted.joint_positions()[:, known]
     torch.testing.assert_close(*positions, atol=1e-6, rtol=0)
-    back = retarget.from_canonical(canonical, rigmap, motion)
-    assert turn_between(back.local_quat_xyzw, motion.local_quat_xyzw) < 1e-6
-    torch.testing.assert_close(back.joint_positions(), motion.joint_positions(), atol=1e-8, rtol=0)
+    assert_returns(motion, canonical, rigmap)
 
 
 @pytest.mark.parametrize(
