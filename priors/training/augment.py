@@ -83,6 +83,10 @@ class Draws:
         some = order < (1 + self.uniform(1) * 3).floor()
         return torch.where(self.uniform(1) < 1 - limbs, some, limb)
 
+    def stretch(self, length: Float[Tensor, " batch"]) -> Bool[Tensor, "batch frames"]:
+        """One run of so many frames, that may reach beyond the window's ends."""
+        return self.mark(self.uniform() * (self.frames + 8 - length).clamp_min(1) - 4, length)
+
     def mark(self, start: Tensor, length: Tensor) -> Bool[Tensor, "batch frames"]:
         """True from each start on for so many frames."""
         frame = torch.arange(self.frames)
@@ -153,18 +157,12 @@ def corrupt(clean: Capture, generator: torch.Generator) -> Capture:
 class _Noise:
     """How noisy each window of a batch is."""
 
-    angle: Float[Tensor, "batch joints"]
-    """Sigma of each of a joint's angles, radians; 0 where positions are noisy."""
-    root: Float[Tensor, " batch"]
-    """Sigma of each coordinate of the hips, metres; 0 where positions are noisy."""
-    position: Float[Tensor, " batch"]
-    """Sigma of each coordinate of every joint's position, metres; 0 where angles are noisy."""
-    stays: Float[Tensor, " batch"]
-    """Share of the noise that comes from the frame before."""
-    given_angle: Float[Tensor, "batch joints"]
-    """Noise of angles that the network is given, radians."""
-    given_root: Float[Tensor, " batch"]
-    """Noise of the hips' position that the network is given, metres."""
+    angle: Float[Tensor, "batch joints"]  # sigma of each of a joint's angles, radians; 0 where positions are noisy
+    root: Float[Tensor, " batch"]  # sigma of each coordinate of the hips, metres; 0 where positions are noisy
+    position: Float[Tensor, " batch"]  # sigma of each coordinate of every joint, metres; 0 where angles are noisy
+    stays: Float[Tensor, " batch"]  # share of the noise that comes from the frame before
+    given_angle: Float[Tensor, "batch joints"]  # noise of angles that the network is given, radians
+    given_root: Float[Tensor, " batch"]  # noise of the hips' position that the network is given, metres
 
 
 _MAX_NOISE_RAD = 0.6  # radians of noise; more is no noise but another motion
@@ -215,8 +213,7 @@ def _estimated_share(stays: Float[Tensor, " batch"]) -> Float[Tensor, " batch"]:
 def _perturb_positions(
     quats: Float[Tensor, "batch frames joints 4"], root: Float[Tensor, "batch frames 3"], noise: _Noise, draw: Draws
 ) -> tuple[Tensor, Tensor]:
-    """Turn the bones of windows whose positions are noisy from each noisy joint to the first one below, and move the
-    hips by their own noise."""
+    """Turn the bones of windows with noisy positions from each joint to the first one below, and move the hips."""
     rows = noise.position.nonzero()[:, 0]
     if len(rows) == 0:
         return quats, root
@@ -290,8 +287,7 @@ _TEMPO, _STRIDES = 0.15, 0.1  # largest changes of a copy's tempo and strides, a
 
 
 def add_copies(corpus: Corpus, count: int, generator: torch.Generator) -> Corpus:
-    """Return a corpus with its clips, and after them so many copies of each, under the same names, with another tempo
-    and other strides."""
+    """Return a corpus with so many copies of each clip after it, under the same names, at other tempos and strides."""
     if count == 0:
         return corpus
     windows = PoseWindows(corpus, evenness=0.0)

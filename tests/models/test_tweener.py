@@ -19,11 +19,12 @@ from mapctl.inbetweening import PositionImage
 from mapctl.inbetweening.missing import MissingMask
 from mapctl.kinematics import heading
 from mapctl.motion_dna import MotionDna
+from mapctl.numerics.intervals import fill_missing_angle
 from mapctl.recording.masks import ALL, Mask
 from mapctl.retarget import to_canonical
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOE_REST_HEIGHT
-from priors.training.recipes.tweener import collect_dna, compute_classes
-from priors.training.windows import interpolate_heading, interpolate_positions
+from priors.training.recipes.infiller import interpolate_positions
+from priors.training.recipes.tweener import collect_dna
 from priors.tweener import (
     INPUT_ROWS,
     PAPER,
@@ -227,7 +228,7 @@ def test_vectors_are_means_over_clips_and_come_back_from_the_card():
     torch.testing.assert_close(classes["both"].vector, (each[0] + each[1]) / 2, atol=2e-3, rtol=2e-3)
     torch.testing.assert_close(classes["one"].vector, each[0], atol=2e-3, rtol=2e-3)
     assert count_clips(card.data)["classes"] == {"both": 2, "one": 1}
-    assert compute_classes(tiny.network(), result)["classes"]["walk"]["clips"] == 3
+    assert encode_classes(encoder, collect_dna(result))["classes"]["walk"]["clips"] == 3
 
 
 @pytest.mark.parametrize("vector", ["%%%", "AAAA", None, "AHwAfAB8AHwAfA=="])
@@ -270,7 +271,7 @@ def image_of(motion, keys, *, present=None, known_axes=None):
     between = interpolate_positions(positions, motion.local_quat_xyzw.float()[None], known)
     return PositionImage.of_world(
         between,
-        interpolate_heading(facing, known),
+        fill_missing_angle(facing, known[..., 0]),
         torch.zeros(1, motion.num_frames, 2),
         known=known,
         present=torch.ones(1, motion.num_frames, dtype=torch.bool) if present is None else present,

@@ -40,7 +40,7 @@ from priors.training.recipes.tweener import (
     group_clips,
     measure_gap,
 )
-from priors.training.windows import FeatureWindows, PoseWindows, PositionWindows, add_targets
+from priors.training.windows import FeatureWindows, PaddedWindows, PoseWindows, add_targets
 from priors.tweener import LABELS, ConstrainedPose, GeneratedPoses, GeneratorNetwork
 
 pytestmark = pytest.mark.usefixtures("small_judgements")
@@ -182,10 +182,10 @@ def test_gaps_grow_until_half_of_training():
 
 @pytest.mark.parametrize("architecture", ["skips", "image"])
 def test_an_infiller_answers_for_what_it_changes(architecture):
-    window = PositionWindows(corpus(2, 60), frames=60, evenness=0.0).draw(4, generator())
-    everything = window.present[..., None].expand(-1, -1, CANONICAL.num_joints)
+    motion, present = PaddedWindows(corpus(2, 60), frames=60, evenness=0.0).draw(4, generator())
+    everything = present[..., None].expand(-1, -1, CANONICAL.num_joints)
     network = tiny_infiller.network(config=replace(tiny_infiller.CONFIG, architecture=architecture))
-    parts = compute_infiller_losses(network, window, everything)
+    parts = compute_infiller_losses(network, motion, present, everything)
     assert parts["error_cm"] == 0
     assert (parts["position"] == 0) == (architecture == "skips")
 
