@@ -323,7 +323,10 @@ class PoseTransformer(checkpoints.NetworkModel[PoseTransformerNetwork], Inbetwee
         known = (~query.missing.root).nonzero()[:, 0]
         origin = query.motion.root_position[known[0] if len(known) else 0].clone()
         origin[1] = 0.0
-        motion = self._show(_move(query, -origin))
+        near = replace(query, motion=replace(query.motion, root_position=query.motion.root_position - origin))
+        if (targets := query.effector_targets) is not None:
+            near = replace(near, effector_targets=replace(targets, positions=targets.positions - origin))
+        motion = self._show(near)
         gaps = _find_silent_gaps(query)
         longest = max((stop - start for start, stop in gaps if stop - start <= MAX_GAP_FRAMES), default=0)
         poses = _average_mirrored(self._propose_windows(motion.with_mirror_image(), longest))
@@ -400,15 +403,6 @@ class PoseTransformer(checkpoints.NetworkModel[PoseTransformerNetwork], Inbetwee
             joined[:, first:stop] = torch.lerp(joined[:, first:stop], rows, fade[:, None])
             weights[first:stop] = 1.0
         return _unpack(joined)
-
-
-def _move(query: GapQuery, shift: Float[Tensor, " 3"]) -> GapQuery:
-    """Return the query moved in the world."""
-    moved = replace(query.motion, root_position=query.motion.root_position + shift)
-    targets = query.effector_targets
-    if targets is not None:
-        targets = replace(targets, positions=targets.positions + shift)
-    return replace(query, motion=moved, effector_targets=targets)
 
 
 def _lay_windows(unknown: Bool[Tensor, " frames"], longest: int) -> Iterator[tuple[int, int]]:

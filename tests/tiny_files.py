@@ -7,7 +7,7 @@ from priors import checkpoints
 
 
 def make_card(kind: str, config: checkpoints.NetworkConfig, **data: Any) -> checkpoints.Card:
-    """Card of invented weights, with what it says of its data."""
+    """Card of invented weights, with these entries on its data."""
     return checkpoints.Card(kind, config.as_card(), licence="none, it is made up", data=data)
 
 

@@ -59,5 +59,5 @@ def count_frames_to_observed(observed: Bool[Tensor, "batch frames"]) -> Float[Te
     frame = torch.arange(observed.shape[1], device=observed.device)
     away = torch.stack([frame - last_observed(observed), next_observed(observed) - frame], dim=-1).float()
     none = ~observed.any(dim=1)
-    # Before the first observed frame the last one is none, and the other way round.
+    # Before the first observed frame the last one is none, and vice versa.
     return torch.where(none[:, None, None] | (away < 0), torch.inf, away)

@@ -59,11 +59,6 @@ class Labels:
         return Labels(names, held)
 
 
-def read_clip_labels(clip: str, pattern: str) -> set[str]:
-    """Parse the labels in one clip's name; none where the pattern is empty or does not match."""
-    return _parse_match(re.search(pattern, clip)) if pattern else set()
-
-
 def read_labels(clips: Sequence[str], pattern: str) -> Labels:
     """Read labels from clips' names by the named groups of a regular expression; an empty pattern reads none.
 
@@ -208,7 +203,8 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
 
     def conditioned_like_clip(self, name: str) -> "LstmGmmDensity":
         """Return the density conditioned on the labels in a clip's path, of those that it has."""
-        given = read_clip_labels(name, self.card.data.get("labels", ""))
+        pattern = self.card.data.get("labels", "")
+        given = _parse_match(re.search(pattern, name)) if pattern else set()
         known = sorted(given & {*self.reference.config.labels})
         return self._with_network(self.reference.conditioned_on(known))
 

@@ -717,8 +717,9 @@ class FastWindow(PreparedRollout):
             np.empty((rows, frames, LAYOUT.size), np.float32),
             np.empty((rows, frames), np.float32),
         )
-        self._d_features, self._d_density = np.zeros_like(self._features), np.zeros_like(self._density)
-        self._d_noise = np.empty_like(self._noise)
+        if keeps:
+            self._d_features, self._d_density = np.zeros_like(self._features), np.zeros_like(self._density)
+            self._d_noise = np.empty_like(self._noise)
         self._rolled = False
 
     def plan(self, noise: Float[Tensor, "batch frames continuous"]) -> DiscreteChoices:

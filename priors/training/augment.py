@@ -16,14 +16,12 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.features import LAYOUT, GroundPose, encode
-from mapctl.inbetweening.partial_motion import PartialMotion
 from mapctl.kinematics import chain_matrices
 from mapctl.motion import Motion
 from mapctl.pose import BodyPose
 from mapctl.recording import Capture
 from mapctl.retarget.carry import fit_hips, lower_hips, reach_ankle_targets
 from mapctl.retarget.character import FEET, LEGS, TOES, limb_extension
-from mapctl.rotations import to_rotation_vector
 from mapctl.skeleton import CANONICAL
 from priors.training.data import Corpus
 from priors.training.windows import PoseWindows
@@ -168,12 +166,9 @@ class _Noise:
 _MAX_NOISE_RAD = 0.6  # radians of noise; more is no noise but another motion
 
 
-def _bone_lengths() -> Float[Tensor, " joints"]:
-    """From each canonical joint to the next, metres; of the last ones, the bone before."""
-    lengths = CANONICAL.offsets.norm(dim=-1).float()
-    return torch.stack(
-        [lengths[below[0]] if (below := CANONICAL.children(joint)) else lengths[joint] for joint in range(_JOINTS)]
-    )
+_LENGTHS = CANONICAL.offsets.norm(dim=-1).float()
+_BONES = torch.stack([_LENGTHS[next(iter(CANONICAL.children(joint)), joint)] for joint in range(_JOINTS)])
+"""From each canonical joint to the next, metres; of the last ones, the bone before."""
 
 
 def _sample_noise(draw: Draws) -> _Noise:
@@ -194,7 +189,7 @@ def _sample_noise(draw: Draws) -> _Noise:
 
 def _angles_of_positions(position: Float[Tensor, " batch"]) -> Float[Tensor, "batch joints"]:
     """Noise of a joint's angles about its parent where both bones point from one noisy position to another, radians."""
-    own = (math.sqrt(2) * position[:, None] / _bone_lengths().to(position)).clamp(max=_MAX_NOISE_RAD)
+    own = (math.sqrt(2) * position[:, None] / _BONES.to(position)).clamp(max=_MAX_NOISE_RAD)
     own = own * torch.tensor([bool(CANONICAL.children(joint)) for joint in range(_JOINTS)])
     above = own[:, [max(0, parent) for parent in CANONICAL.parents]].clone()
     above[:, 0] = 0.0
@@ -310,7 +305,9 @@ def copy_clip(windows: PoseWindows, number: int, *, tempo: float, strides: float
     clip = torch.tensor([number])
     frames = int((int(windows.lengths[number]) - 1) / tempo) + 1
     played = windows.at(clip, torch.zeros_like(clip), frames, torch.tensor([tempo]))
-    features = encode(change_strides(_as_motion(played), strides))[0].float()
+    vectors = rotations.to_rotation_vector(played.quats[0].double())
+    pose = BodyPose(played.root_position[0].double(), played.heading[0].double(), vectors[:, 0, ::2], vectors[:, 1:])
+    features = encode(change_strides(pose.motion(), strides))[0].float()
     time = tempo * torch.arange(frames)
     bits = windows.contacts.split(windows.lengths.tolist())[number]
     features[:, LAYOUT.slices["contacts"]] = bits[time.floor().long()] * bits[time.ceil().long()]
@@ -332,10 +329,3 @@ def change_strides(motion: Motion, factor: float) -> Motion:
     moved = replace(motion, root_position=scale * motion.root_position)
     moved = lower_hips(fit_hips(moved, ankles, stretch), ankles, stretch)
     return reach_ankle_targets(moved, ankles)
-
-
-def _as_motion(played: PartialMotion) -> Motion:
-    """The first of a batch of motions of which everything is known."""
-    vectors = to_rotation_vector(played.quats[0].double())
-    pose = BodyPose(played.root_position[0].double(), played.heading[0].double(), vectors[:, 0, ::2], vectors[:, 1:])
-    return pose.motion()

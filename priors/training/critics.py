@@ -118,9 +118,9 @@ def moment_loss(
     ours, theirs = _Moments.of(generated), _Moments.of(real)
     # Feet may be stiller than mocap's, not looser.
     feet = sum(_log_ratio(a, b).clamp(min=0).square() for a, b in zip(ours.feet, theirs.feet, strict=True))
-    pace = torch.stack(
-        [_log_ratio(generated_, real_).mean() for generated_, real_ in _pair_by_pace(ours.pace, theirs.pace)]
-    )
+    # The slowest quarter of the windows with mocap's slowest, and so on: walks must not make up for slow runs.
+    quarters = zip(*(each.pace.sort().values.chunk(4) for each in (ours, theirs)), strict=True)
+    pace = torch.stack([_log_ratio(one, other).mean() for one, other in quarters])
     return (
         weights.feet * feet
         + weights.jerk * _log_ratio(ours.jerk, theirs.jerk).square().mean()
@@ -173,11 +173,6 @@ def _log_ratio(ours: Tensor, theirs: Tensor) -> Tensor:
     return torch.log(ours) - torch.log(theirs)
 
 
-def _pair_by_pace(ours: Tensor, theirs: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Our slowest quarter of the windows with mocap's slowest, and so on: walks must not make up for slow runs."""
-    return list(zip(ours.sort().values.chunk(4), theirs.sort().values.chunk(4), strict=True))
-
-
 _WIDTH = 128
 _LAYERS = ((3, 1), (5, 2), (5, 2), (3, 1))  # kernel and stride
 _LEAST_STD = 0.01
@@ -209,7 +204,7 @@ class CriticTrainer:
 
     def score(self, generated: Float[Tensor, "batch frames size"], generator: torch.Generator) -> Tensor:
         """Return the density's loss, the negative log probability that its runs are taken for captured (Goodfellow et
-        al. 2014, section 3), whose gradient goes into what generated them; and keep them in place of earlier ones."""
+        al. 2014, section 3), whose gradient goes into what generated them; and keep them instead of earlier ones."""
         assert self.history is not None
         shown = self._show_end(generated)
         self.history.keep(shown.detach(), generator)

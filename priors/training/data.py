@@ -187,7 +187,9 @@ def read_corpus(
     corpus = _read_cache(stored)
     if corpus is None:
         corpus = _read_files(data, files, tables, level, report)
-        _write_cache(corpus, stored)
+        stored.parent.mkdir(parents=True, exist_ok=True)
+        index = json.dumps([corpus.names, corpus.lengths, corpus.skipped])
+        write_tensors(stored, {"features": corpus.features}, metadata={"index": index})
     used = Counter(table for table, _ in map(tables.find, corpus.names) if table)
     described = tuple(f"{table}: {count} of {len(corpus.names)} clips" for table, count in used.items())
     for line in described:
@@ -254,12 +256,6 @@ def _read_cache(stored: Path) -> Corpus | None:
         return None
     whole = len(corpus.names) == len(corpus.lengths) and sum(corpus.lengths) == len(corpus.features)
     return corpus if whole else None
-
-
-def _write_cache(corpus: Corpus, stored: Path) -> None:
-    stored.parent.mkdir(parents=True, exist_ok=True)
-    index = json.dumps([corpus.names, corpus.lengths, corpus.skipped])
-    write_tensors(stored, {"features": corpus.features}, metadata={"index": index})
 
 
 CMU = Path("cmu")
@@ -384,7 +380,12 @@ def stand_on_canonical(motion: Motion, rigmap: RigMap) -> Motion:
     What slopes is turned level as a whole, and each toe then rests as high as the canonical one; hips and steps are in
     the scale of the legs (see `mapctl.retarget.carry`).
     """
-    leveled = _put_on_floor(turn_level(motion, find_floor_slope(motion)))
+    turned = turn_level(motion, find_floor_slope(motion))
+    # Up or down until toes rest about as high as they should: what is far off counts as a platform else.
+    seen = estimate_floor_heights(turned.joint_positions()[:, list(TOE_JOINTS)])
+    root = turned.root_position.clone()
+    root[:, 1] -= (seen - Stance.at_rest(turned.skeleton).toe_height).min()
+    leveled = replace(turned, root_position=root)
     source = RiggedCharacter(rigmap, Stance.of(leveled, rigmap))
     return retarget_canonical(leveled, source, _canonical_body()).motion
 
@@ -434,14 +435,6 @@ def turn_level(motion: Motion, slope: Float[Tensor, "2"]) -> Motion:
     local[:, 0] = rotations.multiply(turn, local[:, 0])
     root = rotations.rotate(turn, motion.root_position - middle) + middle
     return replace(motion, root_position=root, local_quat_xyzw=local)
-
-
-def _put_on_floor(motion: Motion) -> Motion:
-    """Shift up or down until toes rest about as high as they should: what is far off counts as a platform else."""
-    seen = estimate_floor_heights(motion.joint_positions()[:, list(TOE_JOINTS)])
-    root = motion.root_position.clone()
-    root[:, 1] -= (seen - Stance.at_rest(motion.skeleton).toe_height).min()
-    return replace(motion, root_position=root)
 
 
 @cache

@@ -706,7 +706,7 @@ def warmup_cosine(step: int, steps: int) -> float:
     return 0.5 * (1 + math.cos(math.pi * (step - rise) / max(1, steps - rise)))
 
 
-def average_logarithms(values: Iterable[float | None]) -> float:
+def geometric_mean(values: Iterable[float | None]) -> float:
     """Geometric mean of the positive ones among them, NaN of none: a tenth less of any counts alike."""
     logs = [math.log(value) for value in values if value is not None and value > 0]
     return math.exp(sum(logs) / len(logs)) if logs else math.nan

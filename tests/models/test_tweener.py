@@ -248,17 +248,6 @@ def test_an_unknown_class_is_refused_with_the_nearest():
         pick_class({}, "walk")
 
 
-SMALL = GeneratorConfig((8, 8, 8, 12, 12, 12), (12, 12, 8, 8, 8, 8), style=5)
-
-
-def network(config=SMALL, seed=0):
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
-        result = GeneratorNetwork(config)
-        torch.nn.init.normal_(result.last.weight, std=0.05)
-    return result.eval().requires_grad_(False)
-
-
 def count(module):
     return sum(each.numel() for each in module.parameters())
 
@@ -293,7 +282,7 @@ def test_weights_are_as_many_as_may_be_bundled_and_as_in_the_paper():
 
 
 def test_the_style_changes_the_answer_and_does_not_depend_on_the_order_of_its_poses():
-    result, image = network(), image_of(walk(70), (0, 69))
+    result, image = tiny.network(), image_of(walk(70), (0, 69))
     encoder = StyleEncoder(5)
     poses = torch.randn(1, 6, 21, 3, generator=generator())
     found = encoder(poses)
@@ -311,7 +300,7 @@ def test_batch_regularisation_is_nil_for_unit_responses_and_grows_with_mean_and_
     assert float(regularise_batch((unit, unit))) < 1e-6
     assert float(regularise_batch((unit + 0.5,))) == pytest.approx(0.25, rel=1e-3)
     assert float(regularise_batch((unit * 2.0, unit))) == pytest.approx(0.4805, rel=1e-3)
-    responses = network().generate(torch.randn(2, INPUT_ROWS, 128, generator=generator()), torch.zeros(2, 5))[1]
+    responses = tiny.network().generate(torch.randn(2, INPUT_ROWS, 128, generator=generator()), torch.zeros(2, 5))[1]
     assert len(responses) == 6 + 13
 
 

@@ -17,15 +17,7 @@ from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.denoiser import DenoiserConfig, DenoiserNetwork
 from priors.training.augment import corrupt, make_clean_capture
 from priors.training.data import Corpus, Split
-from priors.training.loop import (
-    Count,
-    GradientTrainer,
-    MaybeCount,
-    NetworkSettings,
-    Row,
-    average_logarithms,
-    make_generator,
-)
+from priors.training.loop import Count, GradientTrainer, MaybeCount, NetworkSettings, Row, make_generator
 from priors.training.windows import FeatureWindows, PoseVariation, measure_lengths, vary_features
 
 # Weights beside that of the position error, cm, which is 1.
@@ -89,7 +81,7 @@ class DenoiserTrainer(GradientTrainer[DenoiserNetwork]):
 
     def score(self, row: Row) -> float:
         """Return the loss of unseen windows."""
-        return average_logarithms([row.get("loss")])
+        return row.get("loss") or math.nan
 
 
 def draw_performers(

@@ -24,7 +24,7 @@ from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.infiller import InfillerConfig, InfillerNetwork
 from priors.training.augment import Draws
 from priors.training.data import Corpus, Split
-from priors.training.loop import Count, GradientTrainer, NetworkSettings, Row, average_logarithms, make_generator
+from priors.training.loop import Count, GradientTrainer, NetworkSettings, Row, geometric_mean, make_generator
 from priors.training.windows import PaddedWindows
 
 VALIDATED_GAPS = (15, 30, 60)
@@ -114,7 +114,7 @@ class InfillerTrainer(GradientTrainer[InfillerNetwork]):
     def score(self, row: Row) -> float:
         """Return the error of gaps in unseen windows over that of the guess, geometric mean over their lengths."""
         gaps = [gap for gap in VALIDATED_GAPS if row.get(f"guess_{gap}_cm") and row.get(f"error_{gap}_cm")]
-        return average_logarithms(row[f"error_{gap}_cm"] / row[f"guess_{gap}_cm"] for gap in gaps)
+        return geometric_mean(row[f"error_{gap}_cm"] / row[f"guess_{gap}_cm"] for gap in gaps)
 
 
 def interpolate_positions(

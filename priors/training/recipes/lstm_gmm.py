@@ -486,9 +486,7 @@ def _compute_weights(
     return frames / frames.sum()
 
 
-def measure_free_runs(
-    model: LstmGmm, corpus: Corpus, *, runs: int = 8, frames: int = 1500, temperature: float = 1.0, seed: int = 0
-) -> dict[str, float]:
+def measure_free_runs(model: LstmGmm, corpus: Corpus, *, runs: int = 8, frames: int = 1500) -> dict[str, float]:
     """Speed, height and pose variation of free runs, each as a ratio to the corpus, and the slowest run's last speed.
 
     Runs begin after the first two seconds of clips; their first ten seconds are not counted.
@@ -497,7 +495,7 @@ def measure_free_runs(
     clips = [clips[i * len(clips) // runs % len(clips)] for i in range(runs)]
     state = model.start_after(torch.stack([clip[0] for clip in clips]).to(model.mean.device))
     state = model.advance(state, torch.stack([clip[1:60] for clip in clips]).to(model.mean.device))
-    features, _ = model.sample(state, frames, make_generator(seed), temperature=temperature)
+    features, _ = model.sample(state, frames, make_generator(0))
     settled = features[:, min(_SETTLING_FRAMES, frames // 2) :].cpu()
     own, wanted = summarise_states(settled.flatten(0, 1)), summarise_states(corpus.features)
     result = {f"free_run_{name}_ratio": own[name] / wanted[name] for name in own}

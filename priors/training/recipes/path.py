@@ -18,15 +18,7 @@ from mapctl.inbetweening.root_trajectory import (
 )
 from priors.path import PathConfig, PathNetwork
 from priors.training.data import Corpus, Split
-from priors.training.loop import (
-    Count,
-    GradientTrainer,
-    NetworkSettings,
-    Number,
-    Row,
-    average_logarithms,
-    make_generator,
-)
+from priors.training.loop import Count, GradientTrainer, NetworkSettings, Number, Row, geometric_mean, make_generator
 from priors.training.windows import TEMPO, PoseVariation, PoseWindows
 
 _VALIDATED = ("V1", "V8", "V32", "V64", "Y")
@@ -87,7 +79,7 @@ class PathTrainer(GradientTrainer[PathNetwork]):
 
     def score(self, row: Row) -> float:
         """Return the errors over unseen clips, cm, geometric mean over spans and the height."""
-        return average_logarithms(row.get(f"{name}_cm") for name in _VALIDATED)
+        return geometric_mean(row.get(f"{name}_cm") for name in _VALIDATED)
 
 
 def compute_path_losses(network: PathNetwork, motion: PartialMotion) -> dict[str, Tensor]:

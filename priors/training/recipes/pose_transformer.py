@@ -24,7 +24,7 @@ from priors.training.loop import (
     NetworkSettings,
     Number,
     Row,
-    average_logarithms,
+    geometric_mean,
     make_adam,
     make_generator,
 )
@@ -153,42 +153,29 @@ class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
 
     def score(self, row: Row) -> float:
         """Return the error of unseen windows over the interpolation's, geometric mean over gaps and lost arms."""
-        return average_logarithms(value for name, value in row.items() if name.startswith("share_"))
+        return geometric_mean(value for name, value in row.items() if name.startswith("share_"))
 
+    @torch.no_grad()
     def export(self, parts: Split) -> Export:
         """Calibrate the spread of the proposals on the validation clips, and measure that on the test clips."""
-        calibrate_spread(self, parts.validation)
+        over = zip(QUANTILES, _measure_spread(self.network, parts.validation, seed=1), strict=True)
+        # The nominal share of errors lies within the spreads then.
+        self.network.spread_shift += torch.tensor([float(each.quantile(share)) for share, each in over])
         done = super().export(parts)
-        done.quality |= measure_coverage(self, parts.test)
+        over = zip(QUANTILES, _measure_spread(self.network, parts.test, seed=2), strict=True)
+        done.quality |= {f"within_{share:.0%}": float((each <= 0).float().mean()) for share, each in over}
         return done
 
 
-@torch.no_grad()
-def calibrate_spread(trainer: PoseTransformerTrainer, corpus: Corpus) -> None:
-    """Shift the spreads' logarithms so that the nominal share of errors in unseen windows lies within them."""
-    over = _measure_spread(trainer, corpus, seed=1)
-    shift = [float(each.quantile(share)) for share, each in zip(QUANTILES, over, strict=True)]
-    trainer.network.spread_shift += torch.tensor(shift)
-
-
-@torch.no_grad()
-def measure_coverage(trainer: PoseTransformerTrainer, corpus: Corpus) -> dict[str, float]:
-    """Measure by spread the share of errors in unseen windows that lie within it."""
-    over = _measure_spread(trainer, corpus, seed=2)
-    return {
-        f"within_{share:.0%}": float((each <= 0).float().mean()) for share, each in zip(QUANTILES, over, strict=True)
-    }
-
-
-def _measure_spread(trainer: PoseTransformerTrainer, corpus: Corpus, seed: int) -> list[Tensor]:
+def _measure_spread(network: PoseTransformerNetwork, corpus: Corpus, seed: int) -> list[Tensor]:
     """Measure by quantile the logarithm of errors over the spread."""
     generator, windows = make_generator(seed), PoseWindows(corpus, evenness=1.0)
     found: list[Tensor] = []
     for frames in _CALIBRATED_FRAMES:
         if frames <= int(windows.lengths.max()):
             truth = add_targets(windows.draw(_VALIDATED_WINDOWS, frames, generator, variation=PoseVariation()))
-            shown = hide(trainer.network, sample_known_parts(truth, generator))
-            proposed = trainer.network(shown)
+            shown = hide(network, sample_known_parts(truth, generator))
+            proposed = network(shown)
             distance = (proposed.poses(truth.offsets)[0] - truth.world_poses()[0]).norm(dim=-1)
             unknown = ~shown.known.positions
             found.append((torch.log(distance + 1e-4)[..., None] - proposed.log_spread)[unknown][::7])
@@ -312,7 +299,9 @@ def sample_known_parts(motion: PartialMotion, generator: torch.Generator) -> Par
     draw = Draws(generator, batch, frames)
     kind = draw.uniform()
     lossy, keyed = kind < _LOST, kind > 1 - _KEYS
-    poses = torch.where(keyed[:, None], _sample_keys(draw), _sample_gaps(draw))
+    keys = draw.uniform(frames) < 1 / (2 + draw.uniform(1) * 60)  # here and there, the first frame among them
+    keys[:, 0] = True
+    poses = torch.where(keyed[:, None], keys, _sample_gaps(draw))
     poses = torch.where((lossy & (draw.uniform() < 0.8))[:, None], True, poses)
     known = KnownParts.whole(poses)
     lost = torch.where(lossy[:, None, None], _sample_lost_joints(draw), False)
@@ -355,13 +344,6 @@ def _sample_gaps(draw: Draws) -> Bool[Tensor, "batch frames"]:
                 mask[at : at + length] = [True] * length
                 at += length
         known[row] = torch.tensor(mask)
-    return known
-
-
-def _sample_keys(draw: Draws) -> Bool[Tensor, "batch frames"]:
-    """Single frames here and there, the first one among them."""
-    known = draw.uniform(draw.frames) < 1 / (2 + draw.uniform(1) * 60)
-    known[:, 0] = True
     return known
 
 

@@ -43,7 +43,7 @@ from priors.training.loop import (
     GradientTrainer,
     NetworkSettings,
     Row,
-    average_logarithms,
+    geometric_mean,
     make_generator,
     update_average,
 )
@@ -161,7 +161,7 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
     def score(self, row: Row) -> float:
         """Return the error of the calm answer to unseen transitions over the interpolation's, geometric mean over
         lengths, after a pose and after ten frames."""
-        return average_logarithms(value for name, value in row.items() if name.startswith(("bare_", "past_")))
+        return geometric_mean(value for name, value in row.items() if name.startswith(("bare_", "past_")))
 
     def export(self, parts: Split) -> Export:
         """Return the average of the weights, with draws as wide as they come near to the truth."""
@@ -363,17 +363,17 @@ def find_stitcher_losses(
 
 def _compare(
     network: StitcherNetwork, truth: Transition, sides: Sides, compared: int
-) -> tuple[
-    dict[str, Tensor],
-    Float[Tensor, "sides compared generated joints"],
-    Float[Tensor, "sides compared generated joints"],
-]:
+) -> tuple[dict[str, Tensor], Tensor, Tensor]:
     """Compare the first rows with the truth, and let all of them meet and stand; also return the distances of joints
     from their true positions, and the errors of their steps, metres."""
     generated = sides.features.shape[2]
     true, positions = truth.truth()[:, :compared, :generated], sides.place_joints()
-    # Windows that interpolation nearly solves count for more, or the network learns to fidget where bodies stand still.
-    ease = weigh_windows(truth)[:compared]
+    # Windows that interpolation nearly solves count for more, or the network learns to fidget where bodies stand still:
+    # by a power of its mean error, 1 at 5 cm.
+    with torch.no_grad():
+        body, guess = interpolate(truth)
+        error = (body.joints_world() - guess.joints_world()).norm(dim=-1).mean(dim=(1, 2))[:compared]
+        ease = ((_EASE_METRES + 0.01) / (error + 0.01)) ** _EASE
     wrong = positions[:, :compared] - truth.place_joints(generated)[:, :compared]
     distance = measure_lengths(wrong)
     slip = measure_lengths(torch.diff(wrong, dim=2, prepend=torch.zeros_like(wrong[:, :, :1])))
@@ -382,6 +382,8 @@ def _compare(
     # A draw is compared with no truth: toes that its own sides call planted are to stand.
     stand = torch.cat([true[..., POSE.stop :], sides.features[:, compared:, :, POSE.stop :].detach()], dim=1)
     planted = stand[:, :, 1:] * stand[:, :, :-1]
+    both = truth.frames - generated - 1  # first frame of the overlap, as each side counts
+    apart = measure_lengths(positions[0, :, both:] - positions[1, :, both:].flip(1)).mean(dim=-1)
     phases = torch.cat([sides.at_ends[:, :, None], sides.phases[:, :, : generated - 1]], dim=2)[:, :compared]
     parts = {
         "positions": (ease * distance.mean(dim=(0, 2, 3))).mean(),
@@ -389,27 +391,10 @@ def _compare(
         "state": (ease * (off[..., PACE].mean(dim=-1) + off[..., POSE].mean(dim=-1)).mean(dim=(0, 2))).mean(),
         "contacts": cross_entropy(sides.logits[:, :compared], true[..., POSE.stop :]),
         "feet": (steps * planted).sum() / planted.sum().clamp_min(1),
-        "stitching": measure_apart(positions, truth.frames).mean(),
+        "stitching": apart.mean(),
         "phase": (phases - truth.true_phases()[:, :compared, :generated]).abs().mean(),
     }
     return parts, distance, slip
-
-
-def measure_apart(
-    positions: Float[Tensor, "2 batch generated joints 3"], frames: int
-) -> Float[Tensor, "batch overlap"]:
-    """Measure the mean distance of the sides' joints in the frames that both generated, metres."""
-    generated = positions.shape[2]
-    first = frames - generated
-    return measure_lengths(positions[0, :, first - 1 :] - positions[1, :, first - 1 :].flip(1)).mean(dim=-1)
-
-
-@torch.no_grad()
-def weigh_windows(truth: Transition) -> Float[Tensor, " batch"]:
-    """Weigh transitions by a power (_EASE) of the mean error of the interpolation: 1 at 5 cm."""
-    body, guess = interpolate(truth)
-    error = (body.joints_world() - guess.joints_world()).norm(dim=-1).mean(dim=(1, 2))
-    return ((_EASE_METRES + 0.01) / (error + 0.01)) ** _EASE
 
 
 def interpolate(truth: Transition) -> tuple[BodyPose, BodyPose]:

@@ -39,7 +39,7 @@ from priors.training.loop import (
     Name,
     NetworkSettings,
     Row,
-    average_logarithms,
+    geometric_mean,
     make_generator,
 )
 from priors.training.windows import KINDS, PoseWindows, choose_rows, find_kind, measure_lengths
@@ -208,7 +208,7 @@ class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
         """Return the error of unseen gaps over slerp's, geometric mean over kinds of clips."""
         kinds = [name.removesuffix("_slerp_cm") for name, value in row.items() if name.endswith("_slerp_cm") and value]
         pairs = [(row.get(f"{kind}_error_cm"), row[f"{kind}_slerp_cm"]) for kind in kinds]
-        return average_logarithms(error / slerp for error, slerp in pairs if error is not None)
+        return geometric_mean(error / slerp for error, slerp in pairs if error is not None)
 
     def identify(self) -> Row:
         """Return the path predictor, which must not change between a run's parts."""
@@ -218,7 +218,7 @@ class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
         """Return the weights, with the path predictor and the classes for the card."""
         done = super().export(parts)
         classes = encode_classes(self.network.style, collect_dna(parts.train, self.settings.labels))
-        done.data = {"path": checkpoints.compute_hash(self.settings.path), **classes}
+        done.data = {**self.identify(), **classes}
         return done
 
 
@@ -228,10 +228,10 @@ def find_longest_gap(progress: float) -> float:
 
 
 def choose_parts(
-    known: Bool[Tensor, "batch frames"], heading: Float[Tensor, "batch frames"], partial: bool, rolls: Iterator[float]
+    known: Bool[Tensor, "batch frames"], heading: Float[Tensor, "batch frames"], rolls: Iterator[float]
 ) -> GivenParts:
     """Choose what is known in frames that are keys, of motions with these headings, radians: of most sequences all of
-    the pose, and of all of them unless `partial`."""
+    the pose."""
     whole = GivenParts.whole(known)
     axes, faced, view = whole.axes.clone(), whole.heading.clone(), whole.view.clone()
     for row in range(len(known)):
@@ -239,15 +239,15 @@ def choose_parts(
         runs = [slice(start, stop) for _, start, stop in true_intervals(known[row][:, None])]
         if not runs:
             continue
-        if partial and kind < _HALVES:
+        if kind < _HALVES:
             for run in runs:
                 axes[row, run] = _draw_part(rolls)[:, None]
-        elif partial and kind < _HALVES + _POSITION_KEYS:
+        elif kind < _HALVES + _POSITION_KEYS:
             kept = 0.4 * (next(rolls) < 0.6)
             for run in runs:
                 if next(rolls) >= kept:
                     axes[row, run], faced[row, run] = _GROUND_POSITION, False
-        elif partial and kind < _HALVES + _POSITION_KEYS + _DRAWINGS:
+        elif kind < _HALVES + _POSITION_KEYS + _DRAWINGS:
             view[row] = _draw_view(float(heading[row, runs[0].start]), rolls)
             for run in runs:
                 if next(rolls) < 0.75:
@@ -297,7 +297,7 @@ def _draw_drawing(rolls: Iterator[float]) -> Bool[Tensor, "joints 3"]:
 
 
 def draw_windows(
-    windows: PoseWindows, batch: int, frames: int, *, progress: float, generator: torch.Generator, partial: bool = True
+    windows: PoseWindows, batch: int, frames: int, *, progress: float, generator: torch.Generator
 ) -> KeySequences:
     """Draw windows of single clips, half of them up to the share _TEMPO slower or faster, and keys in them."""
     varied = torch.rand(batch, generator=generator) < 0.5
@@ -311,11 +311,11 @@ def draw_windows(
             row[start:stop] = True
     everywhere = torch.ones_like(known)
     clip = clip[:, None].expand_as(known)
-    return _finish(motion, known, everywhere, clip, partial, rolls, generator)
+    return _finish(motion, known, everywhere, clip, rolls, generator)
 
 
 def draw_splices(
-    windows: PoseWindows, batch: int, frames: int, *, progress: float, generator: torch.Generator, partial: bool = True
+    windows: PoseWindows, batch: int, frames: int, *, progress: float, generator: torch.Generator
 ) -> KeySequences:
     """Draw keys of several clips: of one under 3 s, above that of another one the likelier the longer the gap is."""
     rolls, longest = _roll(generator), find_longest_gap(progress)
@@ -334,7 +334,7 @@ def draw_splices(
     motion = windows.gather(clip, time.double())
     root = rotations.rotate_about_y(motion.root_position, turn) + rotations.lift_ground(shift)
     motion = replace(motion, root_position=root, heading=motion.heading + turn)
-    return _finish(motion, known, truthful, clip, partial, rolls, generator)
+    return _finish(motion, known, truthful, clip, rolls, generator)
 
 
 @dataclass(frozen=True, eq=False)
@@ -430,14 +430,13 @@ def _finish(
     known: Tensor,
     truthful: Tensor,
     clip: Tensor,
-    partial: bool,
     rolls: Iterator[float],
     generator: torch.Generator,
 ) -> KeySequences:
     """Mirror half of the sequences, and choose what is known of keys."""
     mirrored = torch.rand(len(known), generator=generator) < 0.5
     motion = choose_rows(mirrored, motion.mirrored(), motion)
-    return KeySequences(motion, choose_parts(known, motion.heading, partial, rolls), truthful, clip, mirrored)
+    return KeySequences(motion, choose_parts(known, motion.heading, rolls), truthful, clip, mirrored)
 
 
 def compute_tweener_losses(
@@ -459,7 +458,7 @@ def compute_tweener_losses(
     wanted = image.positions - image.positions[..., :1, :]  # seen from the hips, as the generated poses
     local = motion.local_matrices()
     weight = _weigh_frames(known) * sequences.truthful
-    between = _between(weight)
+    between = torch.minimum(weight[:, 1:], weight[:, :-1])
     off = generated_poses.pose.positions - wanted
     steps, wanted_steps = (torch.diff(each, dim=1) for each in (generated_poses.pose.positions, wanted))
     off_steps, planted = steps - wanted_steps, motion.contacts[:, 1:] * motion.contacts[:, :-1]
@@ -483,7 +482,9 @@ def compute_tweener_losses(
     terms |= _compute_path_terms(trajectory, travelled, sequences, some)
     without_root = generated.positions @ generated.local_matrix[..., 0, :, :]
     apart = torch.cdist(style_poses.flatten(-2), without_root.flatten(-2)) / len(CANONICAL.names) ** 0.5
-    terms["style"] = _compute_style_error(apart, styled)
+    # How far the style's poses are from the nearest generated ones that are held for some frames (Eq. 11).
+    nearest = avg_pool1d(apart, _DWELL, stride=1).amin(dim=-1)
+    terms["style"] = _average(nearest.mean(dim=-1), styled.float())
     terms["dwell"] = _compute_dwell_error(apart, known, styled)
     terms["regularisation"] = regularise_batch(tuple(each[some] for each in generated_poses.responses))
     loss = torch.stack([WEIGHTS[name] * value for name, value in terms.items()]).sum()
@@ -531,12 +532,6 @@ def _compute_path_terms(
     }
 
 
-def _compute_style_error(apart: Float[Tensor, "batch poses frames"], counts: Bool[Tensor, " batch"]) -> Tensor:
-    """How far the style's poses are from the nearest generated ones that are held for some frames (Eq. 11), metres."""
-    nearest = avg_pool1d(apart, _DWELL, stride=1).amin(dim=-1)
-    return _average(nearest.mean(dim=-1), counts.float())
-
-
 def _compute_dwell_error(
     apart: Float[Tensor, "batch poses frames"], known: Bool[Tensor, "batch frames"], counts: Bool[Tensor, " batch"]
 ) -> Tensor:
@@ -563,10 +558,6 @@ def _weigh_frames(known: Bool[Tensor, "batch frames"]) -> Float[Tensor, "batch f
 def _average_seconds(values: Float[Tensor, "batch frames columns"]) -> Float[Tensor, "batch seconds columns"]:
     """Average over about a second each, without overlap."""
     return avg_pool1d(values.transpose(1, 2), _ACTIVITY_FRAMES).transpose(1, 2)
-
-
-def _between(weight: Float[Tensor, "batch frames"]) -> Tensor:
-    return torch.minimum(weight[:, 1:], weight[:, :-1])
 
 
 def _average(values: Tensor, weight: Tensor) -> Tensor:
