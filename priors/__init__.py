@@ -1,8 +1,7 @@
 """Learned models: what motion is natural."""
 
 from importlib import import_module
-from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mapctl.errors import CheckpointError
 from priors import checkpoints, weight_sets
@@ -34,19 +33,19 @@ _HOMES = {
 }
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'priors' has no attribute {name!r}")
-    return getattr(_import_model(name), name)
+    return _find_class(name)
+
+
+def _find_class(name: str) -> Any:
+    """Import the class of a model."""
+    return getattr(import_module(f"priors.{_HOMES[name]}"), name)
 
 
 def __dir__() -> list[str]:
     return sorted([*globals(), *_HOMES])
-
-
-def _import_model(name: str) -> ModuleType:
-    """Import the module of a model, which has its `load`."""
-    return import_module(f"priors.{_HOMES[name]}")
 
 
 AUTO = ("locomotion", "general")
@@ -61,35 +60,30 @@ def has_model(name: str) -> bool:
 
 def load(name: str) -> "LstmGmmDensity":
     """Load a bundled prior by name (`locomotion`), or a trained one by its file or run folder."""
-    return _import_model("LstmGmmDensity").load(name)
+    return _find_class("LstmGmmDensity").load(name)
 
 
 def load_choice(name: str | None) -> "list[LstmGmmDensity]":
-    """Load the densities that a --prior leaves to choose from: for `auto` the bundled ones, else the named one, or
-    none."""
-    if name is None:
-        return []
-    return [load(each) for each in (_list_auto() if name == "auto" else (name,))]
-
-
-def _list_auto() -> list[str]:
+    """Load the densities that a --prior leaves to choose from: the bundled ones for `auto`, else the named one."""
+    if name != "auto":
+        return [] if name is None else [load(name)]
     there = weight_sets.list_models()
-    return [name for name in AUTO if name in there] or list(AUTO)  # loading a missing one raises the error
+    return [load(each) for each in [each for each in AUTO if each in there] or AUTO]  # a missing one raises the error
 
 
 def load_refiner(name: str) -> "LstmRefiner":
     """Load a bundled refiner by name (`locomotion-refiner`), or a trained one by its file or run folder."""
-    return _import_model("LstmRefiner").load(name)
+    return _find_class("LstmRefiner").load(name)
 
 
 def load_denoiser(name: str = "denoiser") -> "ConvDenoiser":
     """Load the bundled denoiser, or a trained one by its file or run folder."""
-    return _import_model("ConvDenoiser").load(name)
+    return _find_class("ConvDenoiser").load(name)
 
 
 def load_infiller(name: str) -> "ConvInfiller":
     """Load a trained infiller by its file or run folder."""
-    return _import_model("ConvInfiller").load(name)
+    return _find_class("ConvInfiller").load(name)
 
 
 def load_inbetweener(
@@ -117,29 +111,28 @@ def find_kind(name: str) -> str:
 
 def load_transformer(name: str = "transformer") -> "PoseTransformer":
     """Load the bundled pose transformer, or a trained one by its file or run folder."""
-    return _import_model("PoseTransformer").load(name)
+    return _find_class("PoseTransformer").load(name)
 
 
 def load_tweener(name: str = "tweener", path: str = "path") -> "Tweener":
     """Load the bundled generator of long in-betweens, or a trained one by its file or run folder, with the path
     predictor that it was trained with."""
-    return _import_model("Tweener").load(name, path)
+    return _find_class("Tweener").load(name, path)
 
 
 def load_stitcher(name: str = "stitcher") -> "Stitcher":
-    """Load the bundled stitcher, which fills short gaps in several variations, or a trained one by its file or run
-    folder."""
-    return _import_model("Stitcher").load(name)
+    """Load the bundled stitcher, which fills short gaps in variations, or a trained one by its file or run folder."""
+    return _find_class("Stitcher").load(name)
 
 
 def load_path(name: str = "path") -> "ConvPathPredictor":
     """Load the bundled path predictor, or a trained one by its file or run folder."""
-    return _import_model("ConvPathPredictor").load(name)
+    return _find_class("ConvPathPredictor").load(name)
 
 
 def load_keyframe_timing(name: str = "keyframe-timing") -> "KeyframeTiming":
     """Load the bundled timing of keyframes, or a trained one by its file or run folder."""
-    return _import_model("KeyframeTiming").load(name)
+    return _find_class("KeyframeTiming").load(name)
 
 
 def refiner_of(prior: str, name: str = "auto") -> "LstmRefiner | None":

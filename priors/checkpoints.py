@@ -44,6 +44,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], *, metadata: Mappin
 
 
 N = TypeVar("N", bound=nn.Module)
+M = TypeVar("M", bound="NetworkModel[Any]")
 
 
 class _MotionClass(BaseModel):
@@ -80,11 +81,11 @@ class Card:
     """Kind of network: `lstm-gmm` and so on."""
     config: dict[str, Any]
     """The network's settings."""
-    layout: list[list[Any]]
-    """Blocks of the feature vector: name and width."""
-    fingerprint: str
+    layout: list[list[Any]] = field(default_factory=lambda: [list(block) for block in LAYOUT.blocks])
+    """Blocks of the feature vector: name and width; those of this code if not given."""
+    fingerprint: str = field(default_factory=LAYOUT.fingerprint)
     """Fingerprint of the feature layout."""
-    licence: str
+    licence: str = field(kw_only=True)
     """Licence of the weights."""
     data: Annotated[dict[str, Any], AfterValidator(_check_data)] = field(default_factory=dict)
     """Training data: clips, frames, attribution, split seed."""
@@ -100,11 +101,6 @@ class Card:
 
     def __repr__(self) -> str:
         return f"<{self}>"
-
-    @staticmethod
-    def layout_fields() -> dict[str, Any]:
-        """Return the two layout fields for the features of this code."""
-        return {"layout": [list(block) for block in LAYOUT.blocks], "fingerprint": LAYOUT.fingerprint()}
 
 
 class LoadedModel:
@@ -126,12 +122,24 @@ class LoadedModel:
 class NetworkModel(LoadedModel, Generic[N]):
     """A trained network with its name and card."""
 
+    kind: ClassVar[str]
+    """Kind of network in its card."""
+    parts: ClassVar[tuple[Callable[..., Any], "type[NetworkConfig]"]]
+    """Classes of the network and of its shape."""
+
     name: str
     """Name, file or run folder by which it was requested."""
     network: N
     """Network with its weights, in evaluation mode."""
     card: Card
     """Card of the weights."""
+
+    @classmethod
+    def load(cls: type[M], name: str) -> M:
+        """Load a bundled model, or a trained one by its file or run folder; CheckpointError for anything else."""
+        make, config = cls.parts
+        with open_checkpoint(name, cls.kind) as (tensors, card):
+            return cls(name, build_network(make, config.of_card(card.config), tensors), card)
 
 
 def save(tensors: dict[str, Tensor], card: Card, path: Path, *, half: bool = True) -> None:
@@ -151,8 +159,7 @@ def save(tensors: dict[str, Tensor], card: Card, path: Path, *, half: bool = Tru
 
 
 def encode_json(values: dict[str, Any], path: Path, *, indent: int | None = None) -> str:
-    """Encode the JSON that every parser reads; CheckpointError, naming the file it was for, where a number is not
-    finite."""
+    """Encode JSON that every parser reads; CheckpointError, naming its file, where a number is not finite."""
     try:
         return json.dumps(values, indent=indent, allow_nan=False) + "\n"
     except ValueError as error:
@@ -192,25 +199,16 @@ def open_checkpoint(name: str, kind: str, *, called: str | None = None) -> Itera
         raise CheckpointError(f"{path}: its tensors do not fit its card ({one_line(error, 300)})") from error
 
 
-def build_network(make: Callable[..., N], config: Any, tensors: dict[str, Tensor], **statistics: Tensor) -> N:
+def build_network(make: Callable[..., N], config: Any, tensors: dict[str, Tensor]) -> N:
     """Make a network of this shape and give it the tensors, to be used as it is; RuntimeError where they do not fit.
 
     That is found on the meta device, before a card's numbers take memory.
     """
     with torch.device("meta"), _WithoutDraws():
-        make(config, **statistics).load_state_dict(tensors, assign=True)
-    network = make(config, **statistics)
+        make(config).load_state_dict(tensors, assign=True)
+    network = make(config)
     network.load_state_dict(tensors)
     return network.eval().requires_grad_(False)
-
-
-def load_network(
-    name: str, kind: str, make: Callable[..., N], config: "type[NetworkConfig]", *, called: str | None = None
-) -> tuple[N, Card]:
-    """Load the network of a kind by a bundled name, a file or a run folder, and its card; CheckpointError as in
-    `open_checkpoint`."""
-    with open_checkpoint(name, kind, called=called) as (tensors, card):
-        return build_network(make, config.of_card(card.config), tensors), card
 
 
 class _WithoutDraws(TorchFunctionMode):

@@ -207,6 +207,8 @@ def _smooth(values: Float[Tensor, "batch frames width"], sigma: float) -> Float[
 class ConvDenoiser(checkpoints.NetworkModel[DenoiserNetwork]):
     """A trained denoiser (see mapctl.protocols.Denoiser)."""
 
+    kind, parts = "denoiser", (DenoiserNetwork, DenoiserConfig)
+
     def clean(self, capture: Capture) -> CaptureProposal:
         """Propose the motion of a capture of any length, piece by piece, each with a margin that it shares."""
         pieces, count, margin = [], _CHUNK_FRAMES, _MARGIN_FRAMES
@@ -221,9 +223,3 @@ class ConvDenoiser(checkpoints.NetworkModel[DenoiserNetwork]):
         pose = BodyPose.unpack(packed)
         # Each piece counts whole turns from its own beginning.
         return CaptureProposal(replace(pose, heading=rotations.unwrap_angle(pose.heading)), contacts, spread)
-
-
-def load(name: str) -> ConvDenoiser:
-    """Load the bundled denoiser by name, or one by its file or run folder; CheckpointError if there is none."""
-    network, card = checkpoints.load_network(name, "denoiser", DenoiserNetwork, DenoiserConfig)
-    return ConvDenoiser(name, network, card)

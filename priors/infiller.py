@@ -12,6 +12,7 @@ from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.inbetweening import PositionImage, ProposedPositions
 from mapctl.inbetweening.position_image import mirror_positions
+from mapctl.numerics.intervals import count_frames_to_observed
 from mapctl.protocols import PositionInfiller
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
@@ -81,7 +82,8 @@ class ImageAutoencoder(nn.Module):
         ups = list(zip(reversed(widths), reversed(ins), strict=True))
         self.up = nn.ModuleList(nn.ConvTranspose2d(b, b, 2, stride=2) for b, _ in ups)
         self.up_two = nn.ModuleList(nn.Conv2d(b, a, 3, padding=1) for b, a in ups)
-        _initialise_glorot(self)
+        for parameter in self.parameters():  # as Glorot and Bengio 2010 (Kaufmann et al. 2020, section 3.3)
+            _ = nn.init.xavier_uniform_(parameter) if parameter.dim() > 1 else nn.init.zeros_(parameter)
 
     def forward(self, rows: Float[Tensor, "batch rows frames"]) -> Float[Tensor, "batch rows frames"]:
         """Return the rows anew."""
@@ -102,18 +104,8 @@ def _initialise_zero(layer: nn.Module) -> None:
         nn.init.zeros_(parameter)
 
 
-def _initialise_glorot(network: nn.Module) -> None:
-    """Initialise weights as Glorot and Bengio 2010, biases 0 (Kaufmann et al. 2020, section 3.3)."""
-    for parameter in network.parameters():
-        if parameter.dim() > 1:
-            nn.init.xavier_uniform_(parameter)
-        else:
-            nn.init.zeros_(parameter)
-
-
 PAPER_WIDTHS = (32, 64, 128, 256, 256)
-"""Channels of each unit, so that a sample of 240 frames becomes its 3 x 8 x 256 (Kaufmann et al. 2020, section
-3.2)."""
+"""Channels of each unit: of 240 frames are left 3 x 8 x 256 numbers (Kaufmann et al. 2020, section 3.2)."""
 
 
 _JOINTS = CANONICAL.num_joints
@@ -162,12 +154,15 @@ class InfillerNetwork(nn.Module):
             self.net = ImageAutoencoder(PAPER_WIDTHS)
 
     def forward(self, image: PositionImage) -> ProposedPositions:
-        """Fill an image; ours keeps known positions to the bit, an autoencoder makes all anew (Kaufmann et al. 2020,
-        section 4.2)."""
+        """Fill an image; ours keeps known positions to the bit, an autoencoder makes all anew (section 4.2)."""
         # Joints that are never known are shown at their mean.
         shown = torch.where(image.ever_known[:, None, :, None], image.positions, self.mean)
         rows = self._rows(image, shown)
-        rows = torch.cat([rows, _encode_masks(image)], dim=-1) if self.keeps_observed else rows
+        if self.keeps_observed:
+            # Which joints are known, and how many frames ago and ahead any is, as a share of those that matter.
+            far = count_frames_to_observed(image.known.any(dim=-1)).clamp(max=_MAX_FRAMES_SINCE) / _MAX_FRAMES_SINCE
+            masks = (image.known, image.present[..., None], far)
+            rows = torch.cat([rows, *(each.to(rows) for each in masks)], dim=-1)
         with torch.autocast(rows.device.type, torch.bfloat16, enabled=self.reduced_precision):
             out = self.net(rows.transpose(1, 2)).transpose(1, 2).to(rows.dtype)
         change, contacts = (
@@ -190,23 +185,11 @@ class InfillerNetwork(nn.Module):
         return torch.cat([positions.flatten(-2), step, turn, 2 * image.contacts - 1], dim=-1)
 
 
-def _encode_masks(image: PositionImage) -> Float[Tensor, "batch frames given"]:
-    """Encode which joints are known, and how many frames ago and ahead any is."""
-    some = image.known.any(dim=-1)
-    far = torch.stack([_count_frames_since(some), _count_frames_since(some.flip(1)).flip(1)], dim=-1)
-    return torch.cat([image.known.to(far), image.present[..., None].to(far), far], dim=-1)
-
-
-def _count_frames_since(known: Tensor) -> Float[Tensor, "batch frames"]:
-    """Count frames since a known one, as a share of those that matter; 1 where there was none."""
-    frame = torch.arange(known.shape[1], device=known.device)
-    last = torch.where(known, frame, -_MAX_FRAMES_SINCE).cummax(dim=1).values
-    return (frame - last).clamp(max=_MAX_FRAMES_SINCE) / _MAX_FRAMES_SINCE
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class ConvInfiller(checkpoints.NetworkModel[InfillerNetwork], PositionInfiller):
     """A trained infiller."""
+
+    kind, parts = "infiller", (InfillerNetwork, InfillerConfig)
 
     @torch.no_grad()
     def complete(self, image: PositionImage) -> ProposedPositions:
@@ -217,9 +200,3 @@ class ConvInfiller(checkpoints.NetworkModel[InfillerNetwork], PositionInfiller):
         return ProposedPositions(
             torch.where(image.known[..., None] & self.network.keeps_observed, image.positions, positions), contacts
         )
-
-
-def load(name: str) -> ConvInfiller:
-    """Load a trained infiller by its file or run folder; CheckpointError for anything else."""
-    network, card = checkpoints.load_network(name, "infiller", InfillerNetwork, InfillerConfig)
-    return ConvInfiller(name, network, card)

@@ -61,17 +61,11 @@ class KeyframeTimingNetwork(nn.Module):
 class KeyframeTiming(checkpoints.NetworkModel[KeyframeTimingNetwork]):
     """A fitted regression, as controllers get it."""
 
+    kind, parts = "keyframe-timing", (KeyframeTimingNetwork, KeyframeTimingConfig)
+
     def estimate_seconds(
         self, features: Float[Tensor, "pairs features"], metres: Float[Tensor, " pairs"]
     ) -> Float[Tensor, "pairs 3"]:
         """Estimate the seconds that four of five pairs of keys take at least, that are suggested, and that they take at
         most, by features of the pairs and how far apart they are, metres."""
         return self.network(features, metres)
-
-
-def load(name: str) -> KeyframeTiming:
-    """The bundled timing by name, or a trained one by its file or run folder; CheckpointError if there is none."""
-    network, card = checkpoints.load_network(
-        name, "keyframe-timing", KeyframeTimingNetwork, KeyframeTimingConfig, called="keyframe timing"
-    )
-    return KeyframeTiming(name, network, card)

@@ -172,6 +172,8 @@ def _mix_anchored_steps(motion: LocalMotion, shares: Float[Tensor, "batch frames
 class ConvPathPredictor(checkpoints.NetworkModel[PathNetwork], PathPredictor):
     """A trained path predictor."""
 
+    kind, parts = "path", (PathNetwork, PathConfig)
+
     @torch.no_grad()
     def predict(self, motion: LocalMotion) -> RootTrajectory:
         """Predict the trajectory of motions of any length: the mean of the outputs for them and their mirror images."""
@@ -181,10 +183,3 @@ class ConvPathPredictor(checkpoints.NetworkModel[PathNetwork], PathPredictor):
             (one.height + other.height) / 2,
             (one.contacts + other.contacts) / 2,
         )
-
-
-def load(name: str = "path") -> ConvPathPredictor:
-    """Load the bundled path predictor, or a trained one by its file or run folder; CheckpointError for anything
-    else."""
-    network, card = checkpoints.load_network(name, "path", PathNetwork, PathConfig)
-    return ConvPathPredictor(name, network, card)

@@ -21,7 +21,7 @@ from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts, PartialMotion, interpolate_partial_motion
 from mapctl.inbetweening.query import INTERPOLATION, GapSource
-from mapctl.numerics.intervals import last_observed, next_observed, true_intervals
+from mapctl.numerics.intervals import count_frames_to_observed, true_intervals
 from mapctl.numerics.smooth_offsets import blend_seams_in_positions, blend_seams_in_rotations
 from mapctl.protocols import Inbetweener
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
@@ -71,16 +71,11 @@ class PoseTransformerConfig(NetworkConfig):
 class ProposedPoses:
     """Poses that the network proposes for a partial motion; known values are those of its input."""
 
-    root_position: Float[Tensor, "batch frames 3"]
-    """World position of the hips, metres."""
-    local_matrix: Float[Tensor, "batch frames joints 3 3"]
-    """Local rotations; the hips' is their world rotation."""
-    contacts: Float[Tensor, "batch frames 2"]
-    """Contact logits of the left and the right toe."""
-    log_spread: Float[Tensor, "batch frames joints 2"]
-    """Logarithm of the distance, metres, within which a joint's true position lies with the chances QUANTILES."""
-    rough: "ProposedPoses | None" = None
-    """Proposal of the first of two stages."""
+    root_position: Float[Tensor, "batch frames 3"]  # world position of the hips, metres
+    local_matrix: Float[Tensor, "batch frames joints 3 3"]  # local rotations; the hips' is their world rotation
+    contacts: Float[Tensor, "batch frames 2"]  # contact logits of the left and the right toe
+    log_spread: Float[Tensor, "batch frames joints 2"]  # of metres within which a joint lies with chances QUANTILES
+    rough: "ProposedPoses | None" = None  # proposal of the first of two stages
 
     def poses(self, offsets: Float[Tensor, "batch joints 3"]) -> tuple[Tensor, Tensor]:
         """Return world positions, metres, and world rotation matrices of all joints on these bones."""
@@ -292,12 +287,7 @@ def _difference(values: Float[Tensor, "batch frames *rest"]) -> Float[Tensor, "b
 
 def _encode_distance(known: Bool[Tensor, "batch frames"]) -> Float[Tensor, "batch frames 6"]:
     """Encode frames since and until one was known, each on three scales."""
-    frame = torch.arange(known.shape[1], device=known.device)
-    before, after = frame - last_observed(known), next_observed(known) - frame
-    none = ~known.any(dim=1)[:, None]
-    far = torch.stack(
-        [torch.where((each < 0) | none, 2 * _FAR_FRAMES, each.float()) for each in (before, after)], dim=-1
-    )
+    far = count_frames_to_observed(known).nan_to_num(posinf=2 * _FAR_FRAMES)
     near = torch.exp(-far / _NEAR_FRAMES)
     return torch.cat([far.clamp(max=2 * _FAR_FRAMES) / _FAR_FRAMES, torch.log1p(far) / 3 - 0.7, near], dim=-1)
 
@@ -316,6 +306,8 @@ _PARTNERS = CANONICAL.mirror_partners()
 class PoseTransformer(checkpoints.NetworkModel[PoseTransformerNetwork], Inbetweener):
     """A trained pose transformer."""
 
+    kind, parts = "pose-transformer", (PoseTransformerNetwork, PoseTransformerConfig)
+
     @property
     def takes_partial_keys(self) -> bool:
         """It is conditioned on positions of hands, feet and hips in single frames."""
@@ -331,7 +323,10 @@ class PoseTransformer(checkpoints.NetworkModel[PoseTransformerNetwork], Inbetwee
         known = (~query.missing.root).nonzero()[:, 0]
         origin = query.motion.root_position[known[0] if len(known) else 0].clone()
         origin[1] = 0.0
-        motion = self._show(_move(query, -origin))
+        near = replace(query, motion=replace(query.motion, root_position=query.motion.root_position - origin))
+        if (targets := query.effector_targets) is not None:
+            near = replace(near, effector_targets=replace(targets, positions=targets.positions - origin))
+        motion = self._show(near)
         gaps = _find_silent_gaps(query)
         longest = max((stop - start for start, stop in gaps if stop - start <= MAX_GAP_FRAMES), default=0)
         poses = _average_mirrored(self._propose_windows(motion.with_mirror_image(), longest))
@@ -410,15 +405,6 @@ class PoseTransformer(checkpoints.NetworkModel[PoseTransformerNetwork], Inbetwee
         return _unpack(joined)
 
 
-def _move(query: GapQuery, shift: Float[Tensor, " 3"]) -> GapQuery:
-    """Return the query moved in the world."""
-    moved = replace(query.motion, root_position=query.motion.root_position + shift)
-    targets = query.effector_targets
-    if targets is not None:
-        targets = replace(targets, positions=targets.positions + shift)
-    return replace(query, motion=moved, effector_targets=targets)
-
-
 def _lay_windows(unknown: Bool[Tensor, " frames"], longest: int) -> Iterator[tuple[int, int]]:
     """Yield first frame and one past the last of windows around what is unknown, none longer than the longest."""
     frames = len(unknown)
@@ -472,11 +458,3 @@ def _average_mirrored(poses: ProposedPoses) -> ProposedPoses:
         (logits[:1] + logits[1:].flip(-1)) / 2,
         (spread[:1] + spread[1:, ..., _PARTNERS, :]) / 2,
     )
-
-
-def load(name: str = "transformer") -> PoseTransformer:
-    """Load the bundled pose transformer, or a trained one by its file or run folder; CheckpointError for anything
-    else.
-    """
-    network, card = checkpoints.load_network(name, "pose-transformer", PoseTransformerNetwork, PoseTransformerConfig)
-    return PoseTransformer(name, network, card)

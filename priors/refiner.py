@@ -100,19 +100,14 @@ class RefinerNetwork(nn.Module):
     reach_mean: Tensor
     reach_std: Tensor
 
-    def __init__(self, config: RefinerConfig, *, mean: Tensor, std: Tensor, reach_mean: Tensor, reach_std: Tensor):
-        """Take statistics of the features (size,) and of `compute_end_effectors` (channels,); RuntimeError for other
-        widths."""
+    def __init__(self, config: RefinerConfig, **statistics: Tensor):
+        """Take statistics of the features, `mean` and `std` (size,), and of `compute_end_effectors`, `reach_mean` and
+        `reach_std` (channels,); RuntimeError for other widths."""
         super().__init__()
         self.config = config
         reach = count_channels(config.joints)
-        for name, values, width in (
-            ("mean", mean, LAYOUT.size),
-            ("std", std, LAYOUT.size),
-            ("reach_mean", reach_mean, reach),
-            ("reach_std", reach_std, reach),
-        ):
-            self.register_buffer(name, values.expand(width).clone())
+        for name, width in (("mean", LAYOUT.size), ("std", LAYOUT.size), ("reach_mean", reach), ("reach_std", reach)):
+            self.register_buffer(name, statistics.get(name, torch.ones(())).expand(width).clone())
         seen = 2 * config.lookahead + 1
         self.first = nn.Conv1d(LAYOUT.size + reach, config.width, seen)
         self.lstm = nn.LSTM(config.width, config.memory, batch_first=True)
@@ -128,8 +123,7 @@ class RefinerNetwork(nn.Module):
     def forward(
         self, features: Float[Tensor, "batch given size"], memory: tuple[Tensor, Tensor] | None = None
     ) -> tuple[Float[Tensor, "batch refined size"], tuple[Tensor, Tensor]]:
-        """Return refined frames [lookahead + 1, given - lookahead), contact bits as probabilities, and the LSTM's
-        memory."""
+        """Return refined frames [lookahead + 1, given - lookahead), bits as probabilities, and the LSTM's memory."""
         reach = (compute_end_effectors(features, self.config.joints) - self.reach_mean) / self.reach_std
         seen = torch.cat([((features - self.mean) / self.std)[:, 1:], reach], dim=-1)
         hidden, after = self.lstm(torch.relu(self.first(seen.transpose(1, 2))).transpose(1, 2), memory)
@@ -144,6 +138,8 @@ class RefinerNetwork(nn.Module):
 @dataclass(frozen=True, eq=False, repr=False)
 class LstmRefiner(checkpoints.NetworkModel[RefinerNetwork], Refiner):
     """A trained refiner."""
+
+    kind, parts = "refiner", (RefinerNetwork, RefinerConfig)
 
     def stream(self, pieces: Iterable[Float[Tensor, "batch _ size"]]) -> Iterator[Float[Tensor, "batch _ size"]]:
         """Refine consecutive pieces, `lookahead` frames behind their input, in memory that does not grow.
@@ -172,11 +168,3 @@ def _pad_ends(pieces: Iterable[Tensor], *, before: int, after: int) -> Iterator[
         last = piece[:, -1:]
     if last is not None and after > 0:
         yield last.expand(-1, after, -1)
-
-
-def load(name: str) -> LstmRefiner:
-    """Load a bundled refiner by name, or a trained one by its file or run folder; CheckpointError if there is none."""
-    with checkpoints.open_checkpoint(name, "refiner") as (tensors, card):
-        statistics = {part: tensors[part] for part in ("mean", "std", "reach_mean", "reach_std")}
-        network = checkpoints.build_network(RefinerNetwork, RefinerConfig.of_card(card.config), tensors, **statistics)
-    return LstmRefiner(name, network, card)

@@ -24,11 +24,11 @@ Departures from what is printed:
 
 import math
 from collections.abc import Callable, Generator, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from itertools import pairwise
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -72,24 +72,19 @@ class SidedLinear(nn.Module):
             return torch.baddbmm(self.bias, x, self.weight)
         return self.bias + torch.bmm(x.bfloat16(), self._rounded).float()
 
-    @contextmanager
-    def round_weights(self) -> Iterator[None]:
-        """Multiply in bfloat16; weights are rounded once for all frames generated meanwhile."""
-        self._rounded = self.weight.bfloat16()
-        try:
-            yield
-        finally:
-            self._rounded = None
-
 
 @contextmanager
 def multiply_in_bfloat16(*networks: nn.Module, wanted: bool = True) -> Iterator[None]:
-    """Let all such layers of these networks multiply in bfloat16 meanwhile, if it is wanted."""
-    with ExitStack() as stack:
-        for layer in (layer for network in networks for layer in network.modules()):
-            if wanted and isinstance(layer, SidedLinear):
-                stack.enter_context(layer.round_weights())
+    """Let all sided layers of these networks multiply in bfloat16 meanwhile, if it is wanted: weights are rounded once
+    for all frames that are generated."""
+    layers = [layer for network in networks for layer in network.modules() if isinstance(layer, SidedLinear)]
+    try:
+        for layer in layers if wanted else ():
+            layer._rounded = layer.weight.bfloat16()
         yield
+    finally:
+        for layer in layers:
+            layer._rounded = None
 
 
 class SidedLayers(nn.Module):
@@ -189,16 +184,12 @@ class StitcherConfig(NetworkConfig):
 class Frame:
     """A frame of both sides in physical units, each in its side's own sense of time."""
 
-    features: Float[Tensor, "2 batch size"]
-    """Features."""
-    change: Float[Tensor, "2 batch pose"]
-    """Change of the pose in the step that led there."""
-    paced: Float[Tensor, "2 batch"]
-    """1 where change, step, turn and contacts are known."""
+    features: Float[Tensor, "2 batch size"]  # features
+    change: Float[Tensor, "2 batch pose"]  # change of the pose in the step that led there
+    paced: Float[Tensor, "2 batch"]  # 1 where change, step, turn and contacts are known
 
     def exchange(self) -> "Frame":
-        """Return for each side the other's frame in its own sense of time: the step and turn that led there lead on
-        from there."""
+        """Return for each side the other's frame in its own sense of time: what led there leads on from there."""
         features = self.features.flip(0)
         step, turn = _pick_pace(features)
         back = -rotations.rotate_ground(step, -turn)
@@ -210,16 +201,11 @@ class Frame:
 class Situation:
     """Input of both sides for one frame."""
 
-    now: Frame
-    """Current frames."""
-    target: Frame
-    """Frames to which they go."""
-    position: Float[Tensor, "2 batch 2"]
-    """Position of the target, seen from the current frame in its heading frame, metres."""
-    turn: Float[Tensor, "2 batch"]
-    """Difference of the headings, radians in -pi to pi."""
-    left: Float[Tensor, "2 batch"]
-    """Frames to the target."""
+    now: Frame  # current frames
+    target: Frame  # frames to which they go
+    position: Float[Tensor, "2 batch 2"]  # of the target, seen from the current frame, metres
+    turn: Float[Tensor, "2 batch"]  # difference of the headings, radians in -pi to pi
+    left: Float[Tensor, "2 batch"]  # frames to the target
 
     @staticmethod
     def of(now: Frame, at: GroundPose, target: Frame, target_at: GroundPose, left: float) -> "Situation":
@@ -245,15 +231,13 @@ class Memory:
 
     encoder: tuple[Tensor, Tensor]
     decoder: tuple[Tensor, Tensor]
-    phase: Float[Tensor, "2 batch 4"]
-    """Amplitude times cosine and sine of both toes' phases."""
+    phase: Float[Tensor, "2 batch 4"]  # amplitude times cosine and sine of both toes' phases
 
     def keep(self, before: "Memory", active: Float[Tensor, "2 batch"]) -> "Memory":
         """Return this memory where a side is active, and the one before elsewhere."""
-        pairs = zip(
-            (*self.encoder, *self.decoder, self.phase), (*before.encoder, *before.decoder, before.phase), strict=True
-        )
-        parts = [active[..., None] * now + (1 - active[..., None]) * then for now, then in pairs]
+        kept = active[..., None]
+        ours, theirs = ((*each.encoder, *each.decoder, each.phase) for each in (self, before))
+        parts = [kept * now + (1 - kept) * then for now, then in zip(ours, theirs, strict=True)]
         return Memory((parts[0], parts[1]), (parts[2], parts[3]), parts[4])
 
 
@@ -346,11 +330,11 @@ class StitcherNetwork(nn.Module):
     def begin(self, seen: Float[Tensor, "2 batch seen"]) -> Memory:
         """Return the memory before the first frame."""
         shape = seen.shape[:2]
-
-        def still(width: int) -> tuple[Tensor, Tensor]:
-            return seen.new_zeros(*shape, width), seen.new_zeros(*shape, width)
-
-        return Memory(still(self.config.encoder), still(self.config.decoder), self.first_phase(seen))
+        encoder, decoder = (
+            (seen.new_zeros(*shape, width), seen.new_zeros(*shape, width))
+            for width in (self.config.encoder, self.config.decoder)
+        )
+        return Memory(encoder, decoder, self.first_phase(seen))
 
     def infer_shared(self, seen: Float[Tensor, "2 batch seen"]) -> Gaussian:
         """Tell the distribution of what both sides share, from what they see at first."""
@@ -375,8 +359,7 @@ class StitcherNetwork(nn.Module):
         memory: Memory,
         encoder: tuple[Tensor, Tensor],
     ) -> tuple[Float[Tensor, "2 batch size"], Float[Tensor, "2 batch 2"], Memory]:
-        """Make the next frame's features, contacts as probabilities; also returns the contacts' logits and the memory
-        after it."""
+        """Make the next frame's features, contacts as probabilities, their logits, and the memory after it."""
         output, cell = self.decoder(torch.cat([seen, encoded, latent], dim=-1), memory.decoder)
         share = torch.softmax(self.gate(memory.phase.detach()), dim=-1)
         generated = self.experts(torch.cat([output, latent[..., : self.config.shared]], dim=-1), share)
@@ -404,8 +387,7 @@ class StitcherNetwork(nn.Module):
         )
 
     def _normalise(self, frame: Frame) -> Float[Tensor, "2 batch state"]:
-        """Return features and change in units of their spread, unknown parts of a bare pose at zero, and a flag of
-        them."""
+        """Return features and change in units of spread, unknown parts of a bare pose at zero, and their flag."""
         known = frame.paced[..., None]
         scaled = (frame.features - self.mean) / self.std
         moved = (frame.change / self.change[POSE]).clamp(-_CLAMP, _CLAMP)
@@ -459,25 +441,28 @@ class PosteriorNetwork(nn.Module):
 _MEMORY = 0.7165  # exp(-1/3): what a frame's noise keeps of the frame before, so that it changes over three frames
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class DrawnLatents:
     """Latents from noise drawn before; with zeros the mean answer."""
 
-    shared: Float[Tensor, "batch shared"]
-    """Standard normal."""
-    slow: Float[Tensor, "2 batch generated own"]
-    """Noise of unit variance, slow over frames."""
+    shared: Float[Tensor, "batch shared"]  # standard normal
+    slow: Float[Tensor, "2 batch generated own"]  # noise of unit variance, slow over frames
 
     @staticmethod
-    def calm(config: StitcherConfig, batch: int, generated: int) -> "DrawnLatents":
-        """At the mean."""
+    def calm(config: StitcherConfig, batch: int, frames: int) -> "DrawnLatents":
+        """At the mean, for transitions of so many frames."""
+        generated = count_generated(frames)
         return DrawnLatents(torch.zeros(batch, config.shared), torch.zeros(2, batch, generated, config.own))
 
     @staticmethod
-    def sample(config: StitcherConfig, batch: int, generated: int, generator: torch.Generator) -> "DrawnLatents":
-        """Drawn."""
-        noise = torch.randn(batch, config.shared, generator=generator)
-        return DrawnLatents(noise, _draw_noise(batch, generated, config.own, generator))
+    def sample(config: StitcherConfig, batch: int, frames: int, generator: torch.Generator) -> "DrawnLatents":
+        """Drawn, for transitions of so many frames; a frame's noise keeps a share of that of the frame before."""
+        shared = torch.randn(batch, config.shared, generator=generator)
+        white = torch.randn(2, batch, count_generated(frames), config.own, generator=generator)
+        slow = [white[:, :, 0]]
+        for frame in range(1, white.shape[2]):
+            slow.append(_MEMORY * slow[-1] + (1 - _MEMORY**2) ** 0.5 * white[:, :, frame])
+        return DrawnLatents(shared, torch.stack(slow, dim=2))
 
     def still(self, rows: Bool[Tensor, " batch"]) -> "DrawnLatents":
         """Return the same with some rows at the mean."""
@@ -496,24 +481,13 @@ class DrawnLatents:
         """Return the same with other latents in some rows."""
         return DrawnLatents(self.shared.index_copy(0, index, other.shared), self.slow.index_copy(1, index, other.slow))
 
-    def share(self, prior: Gaussian, seen: Float[Tensor, "2 batch seen"]) -> Float[Tensor, "batch shared"]:
+    def share(self, prior: Gaussian) -> Float[Tensor, "batch shared"]:
         """Latent that both sides share over the transition."""
         return prior.draw(self.shared)
 
     def own(self, prior: Gaussian, encoded: Float[Tensor, "2 batch width"], step: int) -> Float[Tensor, "2 batch own"]:
         """A frame's, of both sides."""
         return prior.draw(self.slow[:, :, step])
-
-
-def _draw_noise(
-    batch: int, frames: int, numbers: int, generator: torch.Generator
-) -> Float[Tensor, "2 batch frames numbers"]:
-    """Draw noise of unit variance for both sides of which a frame keeps a share of the frame before."""
-    white = torch.randn(2, batch, frames, numbers, generator=generator)
-    slow = [white[:, :, 0]]
-    for frame in range(1, frames):
-        slow.append(_MEMORY * slow[-1] + (1 - _MEMORY**2) ** 0.5 * white[:, :, frame])
-    return torch.stack(slow, dim=2)
 
 
 _OVERLAP_SHARE, _MOST_OVERLAP = 8, 6  # K is so much of the frames, and no more
@@ -523,55 +497,59 @@ _OVERLAP_SHARE, _MOST_OVERLAP = 8, 6  # K is so much of the frames, and no more
 class Ends:
     """Known frames of a transition: its two ends, and frames before the one and after the other."""
 
-    features: Float[Tensor, "2 batch context size"]
-    """Frames up to each side's end, which is the last, in the side's own sense of time."""
-    present: Float[Tensor, "2 batch context"]
-    """1 where there is such a frame; the last always is, and those before it without a gap."""
-    position: Float[Tensor, "batch 2"]
-    """Where the second end is over the ground, seen from the first in its heading frame, metres."""
-    turn: Float[Tensor, "batch"]
-    """By how much its heading is another, radians."""
+    features: Float[Tensor, "2 batch context size"]  # frames up to each side's end, in its sense of time
+    present: Float[Tensor, "2 batch context"]  # 1 where there is such a frame; those before the last without a gap
+    position: Float[Tensor, "batch 2"]  # of the second end over the ground, seen from the first, metres
+    turn: Float[Tensor, "batch"]  # by how much its heading is another, radians
+
+    @staticmethod
+    def of(
+        before: Float[Tensor, "batch before size"],
+        after: Float[Tensor, "batch after size"],
+        position: Tensor,
+        turn: Tensor,
+    ) -> "Ends":
+        """Make them of the known frames up to each end, in its side's own sense of time."""
+        context, sides, present = max(before.shape[1], after.shape[1]), [], []
+        for known in (before, after):
+            lead = context - known.shape[1]
+            sides.append(torch.cat([known[:, :1].expand(-1, lead, -1), known], dim=1))
+            present.append((torch.arange(context) >= lead).float().expand(len(known), -1))
+        return Ends(torch.stack(sides), torch.stack(present), position, turn)
+
+    def repeat(self, count: int) -> "Ends":
+        """Return so many copies of the one pair of poses."""
+        features, present = self.features.repeat(1, count, 1, 1), self.present.repeat(1, count, 1)
+        return Ends(features, present, self.position.repeat(count, 1), self.turn.repeat(count))
+
+    def with_mirror_image(self) -> "Ends":
+        """Return these pairs of poses, then their mirror images."""
+        return Ends(
+            torch.cat([self.features, mirror_features(self.features)], dim=1),
+            self.present.repeat(1, 2, 1),
+            torch.cat([self.position, self.position * self.position.new_tensor([-1.0, 1.0])]),
+            torch.cat([self.turn, -self.turn]),
+        )
 
     def frame(self, number: int) -> Frame:
-        """Return a frame, of which change and pace are known where the one before it is; a negative number counts from
-        the end."""
+        """Return a frame, of which change and pace are known where the one before is; negative counts from the end."""
         now, before = self.features[:, :, number], number % self.features.shape[2] - 1
         if before < 0:
             return Frame(now, torch.zeros_like(now[..., POSE]), torch.zeros_like(self.present[:, :, 0]))
         return Frame(now, (now - self.features[:, :, before])[..., POSE], self.present[:, :, before])
 
 
-@runtime_checkable
-class Latents(Protocol):
-    """Source of latents: drawn before, or in training also a posterior's."""
-
-    def share(self, prior: Gaussian, seen: Float[Tensor, "2 batch seen"]) -> Float[Tensor, "batch shared"]:
-        """Latent that both sides share over the transition."""
-        ...
-
-    def own(self, prior: Gaussian, encoded: Float[Tensor, "2 batch width"], step: int) -> Float[Tensor, "2 batch own"]:
-        """A frame's, of both sides."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class Sides:
     """Frames generated by both sides, each from its own end on."""
 
-    frames: int
-    """From one pose to the other."""
-    features: Float[Tensor, "sides batch generated size"]
-    """In each side's own sense of time; contacts are probabilities."""
-    logits: Float[Tensor, "sides batch generated 2"]
-    """Logits of the contacts."""
-    position: Float[Tensor, "sides batch generated 2"]
-    """Ground position of the hips, metres, relative to the first end."""
-    heading: Float[Tensor, "sides batch generated"]
-    """Heading of the hips, radians, likewise."""
-    phases: Float[Tensor, "sides batch generated 4"]
-    """Phases of the generated frames."""
-    at_ends: Float[Tensor, "sides batch 4"]
-    """Phases of the ends themselves."""
+    frames: int  # from one pose to the other
+    features: Float[Tensor, "sides batch generated size"]  # in its own sense of time; contacts are probabilities
+    logits: Float[Tensor, "sides batch generated 2"]  # logits of the contacts
+    position: Float[Tensor, "sides batch generated 2"]  # ground position of the hips, metres, relative to the first end
+    heading: Float[Tensor, "sides batch generated"]  # heading of the hips, radians, likewise
+    phases: Float[Tensor, "sides batch generated 4"]  # phases of the generated frames
+    at_ends: Float[Tensor, "sides batch 4"]  # phases of the ends themselves
 
     def place_joints(self) -> Float[Tensor, "sides batch generated joints 3"]:
         """Place the joints, metres, seen from the first end."""
@@ -581,25 +559,27 @@ class Sides:
         ).unflatten(0, shape)
 
 
-def count_generated(network: StitcherNetwork, frames: int) -> int:
+def count_generated(frames: int) -> int:
     """Count the frames that each side of a transition makes: up to the middle and K beyond it, an eighth of the
     transition and 6 at most, which the paper leaves open; one at least is generated by both."""
     beyond = min(round(frames / _OVERLAP_SHARE), _MOST_OVERLAP)
     return min(max(frames // 2 + beyond, (frames + 1) // 2), frames - 1)
 
 
-def walk_sides(network: StitcherNetwork, ends: Ends, frames: int, latents: Latents) -> Sides:
+def walk_sides(network: StitcherNetwork, ends: Ends, frames: int, latents: DrawnLatents) -> Sides:
     """Walk both sides of a transition of so many frames from pose to pose until they overlap."""
     return StepwiseWork(walk_stepwise(network, ends, frames, latents)).finish()
 
 
-def walk_stepwise(network: StitcherNetwork, ends: Ends, frames: int, latents: Latents) -> Generator[None, None, Sides]:
+def walk_stepwise(
+    network: StitcherNetwork, ends: Ends, frames: int, latents: DrawnLatents
+) -> Generator[None, None, Sides]:
     """Walk both sides as `walk_sides`, a frame at a time."""
     zero = torch.zeros_like(ends.position)
     end, ends_at = ends.frame(-1), GroundPose(torch.stack([zero, ends.position]), torch.stack([zero[:, 0], ends.turn]))
     memory, shared = yield from _enter(network, ends, ends_at, frames, latents)
     here, at, first_phase, rows = end, ends_at, memory.phase, []
-    for step in range(count_generated(network, frames)):
+    for step in range(count_generated(frames)):
         # Towards the other side, or towards the far end once they have met.
         left, target, target_at = frames - 2 * step, here, at
         if left < 1:
@@ -619,7 +599,7 @@ def walk_stepwise(network: StitcherNetwork, ends: Ends, frames: int, latents: La
 
 
 def _enter(
-    network: StitcherNetwork, ends: Ends, at: GroundPose, frames: int, latents: Latents
+    network: StitcherNetwork, ends: Ends, at: GroundPose, frames: int, latents: DrawnLatents
 ) -> Generator[None, None, tuple[Memory, Float[Tensor, "batch shared"]]]:
     """Walk through the frames before each end; returns the memory there and the shared latent."""
     context, end, grounds = ends.features.shape[2], ends.frame(-1), [at]
@@ -630,7 +610,7 @@ def _enter(
         return Situation.of(ends.frame(number), grounds[number], end, at, float(frames + context - 1 - number))
 
     first = network.embed(look(context - 1))
-    shared = latents.share(network.infer_shared(first), first)
+    shared = latents.share(network.infer_shared(first))
     memory, before = network.begin(first), torch.zeros_like(ends.present[:, :, 0])
     for number in range(context - 1):
         there = ends.present[:, :, number]
@@ -655,14 +635,10 @@ def _pick_pace(features: Float[Tensor, "*batch size"]) -> tuple[Float[Tensor, "*
 class Joined:
     """The frames between two poses, seen from the first."""
 
-    root_position: Float[Tensor, "batch frames 3"]
-    """Position of the hips, metres."""
-    quats: Float[Tensor, "batch frames joints 4"]
-    """Local rotations."""
-    contacts: Float[Tensor, "batch frames 2"]
-    """Logits of planted toes."""
-    apart: Float[Tensor, " batch"]
-    """Mean distance of the two sides' joints in the middle of their overlap before they are joined, metres (MMPE)."""
+    root_position: Float[Tensor, "batch frames 3"]  # position of the hips, metres
+    quats: Float[Tensor, "batch frames joints 4"]  # local rotations
+    contacts: Float[Tensor, "batch frames 2"]  # logits of planted toes
+    apart: Float[Tensor, " batch"]  # mean distance of the sides' joints amid their overlap, metres (MMPE)
 
     @property
     def finite(self) -> Bool[Tensor, " batch"]:
@@ -705,8 +681,7 @@ def join_sides(sides: Sides) -> Joined:
 
 
 def _blend(one: Tensor, other: Tensor, first: int, last: int) -> Tensor:
-    """Take the first side's frames up to the overlap, the second's after it, and an even blend between; quaternions on
-    the shortest arc."""
+    """Take the first side up to the overlap, the second after it, and an even blend between (slerp of quaternions)."""
     count = last - first + 1
     share = (torch.arange(1, count + 1, dtype=one.dtype) / (count + 1))[None, :, None]
     a, b = one[:, first - 1 : last], other[:, :count]
@@ -717,40 +692,6 @@ def _blend(one: Tensor, other: Tensor, first: int, last: int) -> Tensor:
 CHUNK = 16
 """Draws at once: batches of one size are rounded alike, so that the first draws do not depend on the count."""
 _LARGEST_SEED = 2**63
-
-
-@dataclass(eq=False)
-class Draws:
-    """Answers that are drawn, to as many pairs of poses as are requested."""
-
-    seed: int
-    """Seed of the noise; each pair of poses has noise of its own."""
-    temperature: float = 1.0
-    """Standard deviation of the noise."""
-    chunks: dict[tuple[bytes, int, int], Joined] = field(default_factory=dict)
-    """Generated ones, by the ends, the frames from one to the other and the number of the chunk."""
-
-    def seed_chunk(self, start: int, chunk: int) -> torch.Generator:
-        """Return the generator of a chunk's noise, for the ends of a gap that starts at a frame."""
-        seed = (self.seed + 1_000_003 * start + 7_919 * chunk) % _LARGEST_SEED
-        return torch.Generator().manual_seed(seed)
-
-    def pick(
-        self, ends: Ends, start: int, frames: int, number: int, make: Callable[[torch.Generator, float], Joined]
-    ) -> Joined | None:
-        """Return the draw of a number for the ends of a gap that starts at a frame, generated by `make` with the chunk
-        that it is in if it is not there; the next finite one where it is not finite, and None where the whole chunk is
-        not.
-        """
-        chunk, row = divmod(number, CHUNK)
-        given = b"".join(part.numpy().tobytes() for part in (ends.features, ends.present, ends.position, ends.turn))
-        if (generated := self.chunks.get((given, frames, chunk))) is None:
-            generated = make(self.seed_chunk(start, chunk), self.temperature)
-            self.chunks[given, frames, chunk] = generated
-        good = generated.finite.roll(-row).nonzero()
-        return generated.row((row + int(good[0])) % CHUNK) if len(good) else None
-
-
 _ROUNDS, _DIFFERENCE = 2, 0.25  # the second in standard deviations of the prior
 _SHARES = (0.25, 0.5, 0.75, 1.0, 1.25)  # of a step
 
@@ -799,16 +740,11 @@ _TRAJECTORY_STRIDE = 6  # frames from one residual of a trajectory to the next
 class Constraints:
     """Constraints on the frames of one gap, on the canonical skeleton, seen from the pose before it."""
 
-    positions: Float[Tensor, "frames joints 3"]
-    """Positions that joints are to have, metres."""
-    wanted: Bool[Tensor, "frames joints"]
-    """Whether a joint is to have one."""
-    facing: Float[Tensor, " faced"]
-    """Headings that the hips are to have, radians."""
-    faced: Int[Tensor, " faced"]
-    """Frames in which they are to have them."""
-    trajectory: Float[Tensor, "frames 2"] | None
-    """Ground positions that the hips are to follow, metres; they may sway about them."""
+    positions: Float[Tensor, "frames joints 3"]  # positions that joints are to have, metres
+    wanted: Bool[Tensor, "frames joints"]  # whether a joint is to have one
+    facing: Float[Tensor, " faced"]  # headings that the hips are to have, radians
+    faced: Int[Tensor, " faced"]  # frames in which they are to have them
+    trajectory: Float[Tensor, "frames 2"] | None  # of the hips on the ground, metres; they may sway
 
     @staticmethod
     def of(query: GapQuery, start: int, stop: int) -> "Constraints | None":
@@ -894,94 +830,79 @@ _PARTNERS = CANONICAL.mirror_partners()
 class Stitcher(checkpoints.NetworkModel[StitcherNetwork], Inbetweener):
     """A trained stitcher (Ren et al. 2024)."""
 
-    draws: Draws | None = None
-    """Source of its draws; without it the answer is the mean one, with the latent at its mean."""
+    kind, parts = "stitcher", (StitcherNetwork, StitcherConfig)
+
+    seed: int | None = None
+    """Seed of its draws; without one the answer is the mean one, with the latent at its mean."""
     number: int = 0
     """Number of the draw that it proposes."""
+    chunks: dict[tuple[bytes, int, int], Joined] = field(default_factory=dict)
+    """Draws so far, by the ends, the frames from one to the other and the number of the chunk."""
 
     @property
     def longest(self) -> int:
         """Frames of the longest gap that it fills."""
         return self.network.config.longest - 1
 
-    def drawing(self, seed: int = 0, temperature: float | None = None) -> "Stitcher":
-        """Return the in-betweener that proposes the first draw with a seed, and by `numbered` the others. The
-        `temperature` is the factor of the noise, a quarter more than that of the weights unless it is given; a higher
-        one makes draws differ more, and come less near to what is likely."""
-        return replace(self, draws=Draws(seed, self._pick_temperature(temperature)), number=0)
+    def drawing(self, seed: int = 0) -> "Stitcher":
+        """Return the in-betweener that proposes the first draw with a seed, and by `numbered` the others. The noise is
+        a quarter wider than that of the weights."""
+        return replace(self, seed=seed, number=0, chunks={})
 
     def numbered(self, number: int) -> "Stitcher":
         """Return the in-betweener that proposes the draw of a `number`, an index from 0 on."""
         return replace(self, number=number)
 
-    @torch.no_grad()
-    def draw(
-        self, ends: Ends, frames: int, *, count: int, generator: torch.Generator, temperature: float | None = None
-    ) -> Joined:
-        """Draw so many answers to one pair of poses, `frames` from the one to the other; the first ones do not depend
-        on the count. The `temperature` is the factor of the noise that `drawing` takes."""
-        heat = self._pick_temperature(temperature)
-        rows = [self._draw_chunk(ends, frames, generator, heat) for _ in range(-(-count // CHUNK))]
-        return Joined(
-            *(torch.cat([getattr(row, name) for row in rows])[:count] for name in Joined.__dataclass_fields__)
-        )
+    @property
+    def _temperature(self) -> float:
+        """Standard deviation of the noise of draws."""
+        return _WIDENED * float(self.network.temperature)
 
-    def _pick_temperature(self, temperature: float | None) -> float:
-        return _WIDENED * float(self.network.temperature) if temperature is None else temperature
-
-    def _draw_chunk(self, ends: Ends, frames: int, generator: torch.Generator, temperature: float) -> Joined:
-        return self._walk(ends, frames, self._draw_latents(frames, generator, temperature))
-
-    def _draw_latents(self, frames: int, generator: torch.Generator, temperature: float) -> DrawnLatents:
-        generated = count_generated(self.network, frames)
-        return DrawnLatents.sample(self.network.config, CHUNK, generated, generator).scale(temperature)
+    def _draw_latents(self, seed: int, start: int, frames: int, chunk: int) -> DrawnLatents:
+        """Draw a chunk's latents, for the ends of a gap that starts at a frame."""
+        noise = torch.Generator().manual_seed((seed + 1_000_003 * start + 7_919 * chunk) % _LARGEST_SEED)
+        return DrawnLatents.sample(self.network.config, CHUNK, frames, noise).scale(self._temperature)
 
     def _walk(self, ends: Ends, frames: int, latents: DrawnLatents) -> Joined:
-        return join_sides(walk_sides(self.network, _repeat(ends, len(latents.shared)), frames, latents))
+        return join_sides(walk_sides(self.network, ends.repeat(len(latents.shared)), frames, latents))
 
     @torch.no_grad()
     def answer(self, ends: Ends, frames: int) -> Joined:
         """Return the calm answer to pairs of poses: the mean of that to them and that to their mirror image."""
-        config, batch = self.network.config, len(ends.position)
-        both = Ends(
-            torch.cat([ends.features, mirror_features(ends.features)], dim=1),
-            torch.cat([ends.present, ends.present], dim=1),
-            torch.cat([ends.position, ends.position * ends.position.new_tensor([-1.0, 1.0])]),
-            torch.cat([ends.turn, -ends.turn]),
-        )
-        calm = DrawnLatents.calm(config, 2 * batch, count_generated(self.network, frames))
-        joined = join_sides(walk_sides(self.network, both, frames, calm))
+        batch = len(ends.position)
+        calm = DrawnLatents.calm(self.network.config, 2 * batch, frames)
+        joined = join_sides(walk_sides(self.network, ends.with_mirror_image(), frames, calm))
         return _average_mirrored(joined, batch)
+
+    @torch.no_grad()
+    def draw(self, ends: Ends, start: int, frames: int, number: int) -> Joined | None:
+        """Return the draw of a number for the ends of a gap that starts at a frame, generated with the chunk that it is
+        in if it is not there; the next finite one where it is not finite, and None where the whole chunk is not."""
+        assert self.seed is not None
+        chunk, row = divmod(number, CHUNK)
+        given = b"".join(part.numpy().tobytes() for part in vars(ends).values())
+        if (generated := self.chunks.get((given, frames, chunk))) is None:
+            generated = self._walk(ends, frames, self._draw_latents(self.seed, start, frames, chunk))
+            self.chunks[given, frames, chunk] = generated
+        good = generated.finite.roll(-row).nonzero()
+        return generated.row((row + int(good[0])) % CHUNK) if len(good) else None
 
     @torch.no_grad()
     def connect(
         self,
-        before: Float[Tensor, "*batch before size"],
+        before: Float[Tensor, "before size"],
         after: Float[Tensor, "batch after size"],
         position: Float[Tensor, "batch 2"],
         turn: Float[Tensor, " batch"],
         frames: int,
-        noise: torch.Generator | None = None,
     ) -> Generator[None, None, Float[Tensor, "batch frames size"]]:
-        """Generate, a frame at a time, transitions from the last frame of `before`, of one motion or of each, to the
-        last of `after`, run backwards, `frames` later, as features from the next frame to that one. Relative to the
-        first it is at `position`, metres, with its heading turned by `turn`, radians. The other frames of both are
-        context. Transitions are the mean ones, or drawn where there is `noise`."""
-        before = before[..., -1 - MAX_CONTEXT :, :].expand(len(after), -1, -1)
+        """Generate, a frame at a time, the mean transitions from the last frame of `before` to the last of `after`, run
+        backwards, `frames` later, as features from the next frame to that one. Relative to the first it is at
+        `position`, metres, with its heading turned by `turn`, radians. The other frames of both are context."""
+        before = before[-1 - MAX_CONTEXT :].expand(len(after), -1, -1)
         after = after[:, -1 - MAX_CONTEXT :]
-        context = max(before.shape[1], after.shape[1])
-        sides, present = [], []
-        for known in (before, after):
-            lead = context - known.shape[1]
-            sides.append(torch.cat([known[:, :1].expand(-1, lead, -1), known], dim=1))
-            present.append((torch.arange(context) >= lead).float().expand(len(after), -1))
-        ends = Ends(torch.stack(sides), torch.stack(present), position, turn)
-        config, generated = self.network.config, count_generated(self.network, frames)
-        latents = DrawnLatents.calm(config, len(position), generated)
-        if noise is not None:
-            latents = DrawnLatents.sample(config, len(position), generated, noise).scale(
-                float(self.network.temperature)
-            )
+        latents = DrawnLatents.calm(self.network.config, len(after), frames)
+        ends = Ends.of(before, after, position, turn)
         joined = join_sides((yield from walk_stepwise(self.network, ends, frames, latents)))
         origin = GroundPose(torch.zeros_like(position), torch.zeros_like(turn))
         first, last = (
@@ -1012,21 +933,19 @@ class Stitcher(checkpoints.NetworkModel[StitcherNetwork], Inbetweener):
         sources = []
         whole = query.hide_partial_keys()
         for start, stop in whole.enclosed_gaps:
-            reason, remark, found, constraints = self._refuse(whole, start, stop), "", None, None
+            reason, remark, found = self._refuse(whole, start, stop), "", None
             if not reason:
                 ends, constraints = (
                     see_ends(body, whole.missing.frames, start, stop),
                     Constraints.of(query, start, stop),
                 )
-                found = (
-                    self._find(ends, start, stop) if constraints is None else self._fit(ends, start, stop, constraints)
-                )
-            if found is not None and constraints is not None:
-                off = constraints.measure_farthest(found)
-                remark = f"led by the constraints in it, of which it is {100 * query.scale * off:.1f} cm off unbent"
-                if query.keep_trajectory and off > _FARTHEST:
-                    reason = f"with steps that stay {query.scale * off:.2f} m off the trajectory"
-                found = None if reason else constraints.lay_along(found)
+                found = self._find(ends, start, stop - start + 1, constraints)
+                if found is not None and constraints is not None:
+                    off = constraints.measure_farthest(found)
+                    remark = f"led by the constraints in it, of which it is {100 * query.scale * off:.1f} cm off unbent"
+                    if query.keep_trajectory and off > _FARTHEST:
+                        reason = f"with steps that stay {query.scale * off:.2f} m off the trajectory"
+                    found = None if reason else constraints.lay_along(found)
             parts = [gap for gap in query.enclosed_gaps if start <= gap[0] and gap[1] <= stop] or [(start, stop)]
             if found is None:
                 sources += [GapSource(*gap, INTERPOLATION, reason or _NOT_FINITE) for gap in parts]
@@ -1040,32 +959,24 @@ class Stitcher(checkpoints.NetworkModel[StitcherNetwork], Inbetweener):
         moved = replace(body, root_position=root, local_quat_xyzw=rotations.make_sign_continuous(quats))
         return Proposal(query.to_character(moved), logits, SOURCE, tuple(sources))
 
-    def _find(self, ends: Ends, start: int, stop: int) -> Joined | None:
-        """Find the answer to the ends of a gap; None where it is not finite."""
-        frames = stop - start + 1
-        if self.draws is not None:
-            return self.draws.pick(
-                ends, start, frames, self.number, lambda noise, heat: self._draw_chunk(ends, frames, noise, heat)
-            )
-        calm = self.answer(ends, frames)
-        return calm if bool(calm.finite.all()) else None
-
-    def _fit(self, ends: Ends, start: int, stop: int, constraints: Constraints) -> Joined | None:
-        """Find the answer that meets the constraints on a gap, near the calm one or near the draw of this number; None
-        where it is not finite."""
-        frames, draws = stop - start + 1, self.draws
-        if draws is None:
-            spread = self._pick_temperature(None)
-            around = DrawnLatents.calm(self.network.config, 1, count_generated(self.network, frames))
+    def _find(self, ends: Ends, start: int, frames: int, constraints: Constraints | None) -> Joined | None:
+        """Find the answer to the ends of a gap: the calm one or the draw of this number, or the one near it that meets
+        constraints; None where it is not finite."""
+        config = self.network.config
+        if constraints is None:
+            if self.seed is not None:
+                return self.draw(ends, start, frames, self.number)
+            found = self.answer(ends, frames)
         else:
-            chunk, row = divmod(self.number, CHUNK)
-            spread = draws.temperature
-            around = self._draw_latents(frames, draws.seed_chunk(start, chunk), spread).rows(torch.tensor([row]))
+            latents = DrawnLatents.calm(config, 1, frames)
+            if self.seed is not None:
+                chunk, row = divmod(self.number, CHUNK)
+                latents = self._draw_latents(self.seed, start, frames, chunk).rows(torch.tensor([row]))
 
-        def make(shared: Float[Tensor, "batch shared"]) -> Joined:
-            return self._walk(ends, frames, DrawnLatents(shared, around.slow.expand(-1, len(shared), -1, -1)))
+            def make(shared: Float[Tensor, "batch shared"]) -> Joined:
+                return self._walk(ends, frames, DrawnLatents(shared, latents.slow.expand(-1, len(shared), -1, -1)))
 
-        found = fit_shared(make, constraints.measure, around.shared[0], spread)
+            found = fit_shared(make, constraints.measure, latents.shared[0], self._temperature)
         return found if bool(found.finite.all()) else None
 
     def _refuse(self, query: GapQuery, start: int, stop: int) -> str:
@@ -1079,22 +990,15 @@ class Stitcher(checkpoints.NetworkModel[StitcherNetwork], Inbetweener):
 
 
 def see_ends(body: Motion, missing: Tensor, start: int, stop: int) -> Ends:
-    """See the ends of a gap in a canonical motion of unit size, and whole frames beside it, of which `missing` has
-    none."""
-    features, present = [], []
+    """See the ends of a gap in a motion of unit size, and whole frames beside it, of which `missing` has none."""
     before, after = _count_known(missing, start - 1, -1), _count_known(missing, stop, 1)
-    context = 1 + max(before, after)
-    there = _encode(body, start - 1 - before, start)
-    back = reversed_features(_encode(body, stop, stop + 1 + after))
-    for rows, count in ((there[-1 - before :], before), (back[-1 - after :], after)):
-        lead = context - 1 - count
-        features.append(torch.cat([rows[:1].expand(lead, -1), rows])[None])
-        present.append((torch.arange(context) >= lead).float()[None])
+    there = _encode(body, start - 1 - before, start)[-1 - before :]
+    back = reversed_features(_encode(body, stop, stop + 1 + after))[-1 - after :]
     heading = rotations.split_heading(body.local_quat_xyzw[[start - 1, stop], 0])[0]
     away = (body.root_position[stop] - body.root_position[start - 1])[[0, 2]]
     position = rotations.rotate_ground(away, -heading[0]).float()[None]
     turn = rotations.wrap_angle(heading[1] - heading[0]).float()[None]
-    return Ends(torch.stack(features).float(), torch.stack(present), position, turn)
+    return Ends.of(there.float()[None], back.float()[None], position, turn)
 
 
 def _count_known(missing: Tensor, at: int, step: int) -> int:
@@ -1137,16 +1041,6 @@ def _average_mirrored(joined: Joined, batch: int) -> Joined:
     return Joined(root, quats, logits, (joined.apart[:batch] + joined.apart[batch:]) / 2)
 
 
-def _repeat(ends: Ends, count: int) -> Ends:
-    """Repeat the one pair of poses."""
-    return Ends(
-        ends.features.expand(-1, count, -1, -1).contiguous(),
-        ends.present.expand(-1, count, -1).contiguous(),
-        ends.position.expand(count, -1).contiguous(),
-        ends.turn.expand(count).contiguous(),
-    )
-
-
 def _list_partly_known(query: GapQuery) -> list[GapSource]:
     """List runs of frames that are known in part, or have nothing known on one side."""
     rest = query.missing.frames.clone()
@@ -1154,9 +1048,3 @@ def _list_partly_known(query: GapQuery) -> list[GapSource]:
         rest[start:stop] = False
     reason = f"known in part or on one side alone, where the {SOURCE} takes whole poses"
     return [GapSource(start, stop, INTERPOLATION, reason) for _, start, stop in true_intervals(rest[:, None])]
-
-
-def load(name: str = "stitcher") -> Stitcher:
-    """Load the bundled stitcher, or a trained one by its file or run folder; CheckpointError for anything else."""
-    network, card = checkpoints.load_network(name, "stitcher", StitcherNetwork, StitcherConfig)
-    return Stitcher(name, network, card)

@@ -33,14 +33,13 @@ from mapctl.joint_ranges import JointRanges
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
 from mapctl.motion_dna import MotionDna
-from mapctl.numerics.intervals import last_observed, next_observed, true_intervals
+from mapctl.numerics.intervals import count_frames_to_observed, true_intervals
 from mapctl.numerics.smooth_offsets import interpolate_turns, smooth_between
 from mapctl.protocols import Inbetweener, PathPredictor
-from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOE_REST_HEIGHT, Skeleton
+from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOE_REST_HEIGHT
 from priors import checkpoints
-from priors import path as path_predictor
 from priors.checkpoints import Card, NetworkConfig
-from priors.path import ResidualConv
+from priors.path import ConvPathPredictor, ResidualConv
 
 _SAMPLES = 129  # of a curve, to tell how long it is
 _SHORT, _WHOLE = 1.0, 2.0  # seconds: straight as long as the first, wholly curved from the second on
@@ -201,10 +200,8 @@ POSE_ROWS = ROOT_ROWS + 3 * _OTHERS
 class ConstrainedPose:
     """Poses within the ranges of the joints."""
 
-    local_matrix: Float[Tensor, "*batch joints 3 3"]
-    """Local rotations; the hips' is in the frame in which it was given."""
-    positions: Float[Tensor, "*batch joints 3"]
-    """Joint positions from the hips, metres, in the same frame."""
+    local_matrix: Float[Tensor, "*batch joints 3 3"]  # local rotations; the hips' is in the frame in which it was given
+    positions: Float[Tensor, "*batch joints 3"]  # joint positions from the hips, metres, in the same frame
 
 
 class RangeConstrainedKinematics(nn.Module):
@@ -215,11 +212,9 @@ class RangeConstrainedKinematics(nn.Module):
     low: Tensor
     high: Tensor
 
-    def __init__(self, ranges: JointRanges | None = None, skeleton: Skeleton = CANONICAL):
-        """With the bundled ranges, if none are given, on the bones of a skeleton of canonical joints."""
+    def __init__(self):
         super().__init__()
-        ranges = joint_ranges.load() if ranges is None else ranges
-        self.skeleton = skeleton
+        ranges = joint_ranges.load()
         # They are the code's, not learnt: weights do not hold them, the card lists them.
         for name in ("axes", "mid_matrix", "low", "high"):
             values = getattr(ranges, name)
@@ -233,7 +228,7 @@ class RangeConstrainedKinematics(nn.Module):
         ranges = JointRanges(self.axes, self.mid_matrix, self.low, self.high)
         others = ranges.to_matrices(ranges.constrain(free.unflatten(-1, (_OTHERS, 3))))
         local = torch.cat([rotations.from_six(root)[..., None, :, :], others], dim=-3)
-        return ConstrainedPose(local, kinematics.positions_from_matrices(self.skeleton, local))
+        return ConstrainedPose(local, kinematics.positions_from_matrices(CANONICAL, local))
 
 
 _POSITION_ROWS = 3 * CANONICAL.num_joints
@@ -243,8 +238,7 @@ INPUT_ROWS = 2 * _POSITION_ROWS + _TRAVEL_ROWS + _TIME_ROWS + _CONTACT_ROWS
 """Rows of the dense input: nearest known coordinates and how far they are, the reference's velocities, time since and
 until anything is known, contacts."""
 MAX_KEY_FRAMES = 480
-"""Frames at the prior's rate beyond which it is all one how far a key is: 16 s, about what a frame of the output
-sees."""
+"""Frames at the prior's rate beyond which it is all one how far a key is: 16 s, about what an output frame sees."""
 _VELOCITY_UNIT, _HEADING_UNIT = 0.05, 0.05  # one unit of the reference's velocities: metres and radians a frame
 _STAGES = 6
 _STRIDE = 2**_STAGES
@@ -283,10 +277,8 @@ PAPER = GeneratorConfig((384, 384, 512, 512, 768, 1024), (1024, 768, 768, 512, 5
 class GeneratedPoses:
     """Poses that the generator proposes."""
 
-    pose: ConstrainedPose
-    """Rotations and positions from the hips, seen along the reference's heading."""
-    responses: tuple[Tensor, ...]
-    """Outputs of its convolutions, for batch regularisation."""
+    pose: ConstrainedPose  # rotations and positions from the hips, seen along the reference's heading
+    responses: tuple[Tensor, ...]  # outputs of its convolutions, for batch regularisation
 
     def turn_to_world(self, image: PositionImage) -> ConstrainedPose:
         """Turn the poses from along the reference of their image to the world's axes."""
@@ -297,8 +289,7 @@ class GeneratedPoses:
 
 
 class StyleEncoder(nn.Module):
-    """Poses of a motion in, in any number and order; one vector out: the motion DNA (Zhou et al. 2020, section
-    3.5.1)."""
+    """Poses of a motion in, in any number and order; one vector out: the motion DNA (Zhou et al. 2020, 3.5.1)."""
 
     def __init__(self, style: int):
         super().__init__()
@@ -322,30 +313,30 @@ class GeneratorNetwork(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self, config: GeneratorConfig | None = None, *, bfloat16: bool = False):
+    def __init__(self, config: GeneratorConfig, *, bfloat16: bool = False):
         """Compute convolutions in bfloat16 if so asked; what they are given and give back is not."""
         super().__init__()
-        self.config, self.reduced_precision = config or GeneratorConfig(), bfloat16
+        self.config, self.reduced_precision = config, bfloat16
         self.register_buffer("mean", torch.zeros(CANONICAL.num_joints, 3))
         self.register_buffer("std", torch.ones(CANONICAL.num_joints, 3))
-        widths, style = self.config.widths, self.config.style
+        widths, style = config.widths, config.style
         self.style = StyleEncoder(style)
         self.encoder = nn.ModuleList(
             ResidualConv(channels, kernel=4, stride=2, padding=1, ratio=ratio)
             for channels, ratio in zip(zip((INPUT_ROWS, *widths[:-1]), widths, strict=True), _DOWN_RATIOS, strict=True)
         )
-        self.decoder = nn.ModuleList(_make_decoder(widths[-1] + style, self.config.up_widths))
+        self.decoder = nn.ModuleList(_make_decoder(widths[-1] + style, config.up_widths))
         seen = reversed((INPUT_ROWS, *widths[:-1]))
         self.skips = nn.ModuleList(
-            nn.Conv1d(ins, outs, 1) for ins, outs in zip(seen, self.config.up_widths, strict=True) if self.config.skips
+            nn.Conv1d(ins, outs, 1) for ins, outs in zip(seen, config.up_widths, strict=True) if config.skips
         )
         # Through the middle alone a style has to pass what the keys dictate, and is soon left aside.
-        self.styles = nn.ModuleList(nn.Linear(style, outs) for outs in self.config.up_widths if self.config.skips)
+        self.styles = nn.ModuleList(nn.Linear(style, outs) for outs in config.up_widths if config.skips)
         # Without a PReLU, which would halve the angles on one side.
-        self.last = nn.Conv1d(self.config.up_widths[-1], POSE_ROWS, 3, padding=1)
+        self.last = nn.Conv1d(config.up_widths[-1], POSE_ROWS, 3, padding=1)
         self.kinematics = RangeConstrainedKinematics()
         # Hips upright and joints about the middle of their ranges, until training.
-        nn.init.normal_(self.last.weight, std=0.1 / math.sqrt(3 * self.config.up_widths[-1]))
+        nn.init.normal_(self.last.weight, std=0.1 / math.sqrt(3 * config.up_widths[-1]))
         middle = torch.zeros(POSE_ROWS)
         middle[:6] = rotations.to_six(torch.eye(3, device="cpu"))
         self.last.bias = nn.Parameter(middle)
@@ -383,7 +374,8 @@ class GeneratorNetwork(nn.Module):
         copied, away = image.copy_nearest()
         given = torch.isfinite(away)
         positions = torch.where(given, (copied - self.mean) / self.std, 0.0)
-        distances, times = _scale_frames(away), _encode_times(image)
+        some = image.known_axes.flatten(2).any(dim=-1)
+        distances, times = _scale_frames(away), _scale_frames(count_frames_to_observed(some))
         step = torch.diff(image.ground, dim=1, prepend=image.ground[:, :1])
         step = rotations.rotate_ground(step, -image.heading) / _VELOCITY_UNIT
         turn = torch.diff(image.heading, dim=1, prepend=image.heading[:, :1])[..., None] / _HEADING_UNIT
@@ -428,17 +420,6 @@ def _make_decoder(inputs: int, widths: tuple[int, ...]) -> list[ResidualConv]:
 def _scale_frames(away: Tensor) -> Tensor:
     """Scale numbers of frames to 0..1, by their logarithm: near a key every frame counts."""
     return torch.log1p(away.clamp(max=MAX_KEY_FRAMES)) / math.log1p(MAX_KEY_FRAMES)
-
-
-def _encode_times(image: PositionImage) -> Float[Tensor, "batch frames times"]:
-    """Encode how many frames ago and ahead anything is known."""
-    some = image.known_axes.flatten(2).any(dim=-1)
-    frame = torch.arange(some.shape[1], device=some.device)
-    never = ~some.any(dim=1, keepdim=True)
-    ago, ahead = frame - last_observed(some), next_observed(some) - frame
-    # Before the first known frame the last one is none, and the other way round.
-    times = [torch.where(never | (each < 0), MAX_KEY_FRAMES, each).to(image.positions) for each in (ago, ahead)]
-    return _scale_frames(torch.stack(times, dim=-1))
 
 
 LABELS = r"^.*dataset-\d+_([^_/]+)_[^/]*$|^(?:.*/)?([^/]+/[^/]+)/[^/]+$|^([^/]+)/[^/]+$|^(.*?)[\d_ -]*\.[^.]*$"
@@ -580,10 +561,8 @@ PART_FRAMES = MAX_KEY_FRAMES // 2
 class Split(NamedTuple):
     """A gap that is longer than the network sees."""
 
-    start: int
-    """First frame."""
-    stop: int
-    """One past its last."""
+    start: int  # first frame
+    stop: int  # one past its last
 
     @property
     def frames(self) -> list[int]:
@@ -640,12 +619,28 @@ _KEY_SECONDS = 0.5  # over which what a key was missed by fades away from it
 class Tweener(checkpoints.NetworkModel[GeneratorNetwork], Inbetweener):
     """A trained generator of long in-betweens with the path predictor that it was trained with."""
 
+    kind = "tweener"
+
     path: PathPredictor
     """Predictor of the root trajectory."""
     style: Style | None = field(default=None)
     """How to move; None leaves it to the keys."""
     classes: Mapping[str, Style] = field(default_factory=dict)
     """Styles that the weights know by name."""
+
+    @classmethod
+    def load(cls, name: str, path: str = "path") -> "Tweener":
+        """Load the bundled tweener, or a trained one by its file or run folder, with the path predictor that it was
+        trained with; CheckpointError for anything else, and for another path predictor."""
+        with checkpoints.open_checkpoint(name, cls.kind) as (tensors, card):
+            network = checkpoints.build_network(GeneratorNetwork, GeneratorConfig.of_card(card.config), tensors)
+        classes = read_classes(card, network.config.style)
+        wanted, found = card.data.get("path"), checkpoints.compute_hash(path)
+        if wanted != found:
+            raise CheckpointError(
+                f"{name} was trained with the path predictor {str(wanted)[:12]}; {path} is {found}: name it by --path"
+            )
+        return Tweener(name, network, card, ConvPathPredictor.load(path), classes=classes)
 
     @property
     def has_style(self) -> bool:
@@ -740,10 +735,11 @@ class Tweener(checkpoints.NetworkModel[GeneratorNetwork], Inbetweener):
     def _lead(
         self, body: Motion, query: GapQuery, origin: Float[Tensor, " 3"]
     ) -> tuple[Motion, Float[Tensor, "frames 2"]]:
-        """Lead the hips by how the body moves, from known position to known position, at unit size; also return the
-        contacts' logits."""
+        """Lead the hips by how the body moves, from known position to known position; also return contacts' logits."""
         trajectory, logits = self._walk(body)
-        loose = None if query.loose is None else _shift(query.loose.scaled(1 / query.scale), -origin)
+        loose = None if query.loose is None else query.loose.scaled(1 / query.scale)
+        if loose is not None:
+            loose = replace(loose, ground=loose.ground - origin[::2])
         led = lead_over_keys(trajectory, body.root_position - origin, query.missing.root, loose)
         given = ~query.missing.root if loose is None else ~query.missing.root | loose.placed
         calm = smooth_between(led, given, hertz=TREMBLE_HZ, fps=PRIOR_FPS) + origin
@@ -756,9 +752,9 @@ class Tweener(checkpoints.NetworkModel[GeneratorNetwork], Inbetweener):
 
 
 def _show(query: GapQuery, given: Mapping[int, Float[Tensor, "joints 3"]]) -> tuple[PositionImage, Float[Tensor, " 3"]]:
-    """Return the query, and poses given by frame, as the network takes it, of unit size and near the origin,
-    and where that origin is."""
-    body, known = _walk_over(query), _find_given_joints(query)
+    """Return the query and poses given by frame as the network takes them, of unit size, and where its origin is."""
+    # Joints are given in the world, or about hips of whose whole body the ground position alone is missing.
+    body, known = _walk_over(query), query.known_positions | ~query.missing.joints.any(dim=1, keepdim=True)
     placed = known[:, 0].nonzero()[:, 0]
     origin = body.root_position[placed[0] if len(placed) else 0] * torch.tensor([1.0, 0.0, 1.0]).double()
     positions = body.joint_positions()
@@ -797,16 +793,6 @@ def _walk_over(query: GapQuery) -> Motion:
     return replace(motion, root_position=root, local_quat_xyzw=quats)
 
 
-def _find_given_joints(query: GapQuery) -> Bool[Tensor, "frames joints"]:
-    """Find the joints whose positions are given: in the world, or about hips of whose whole body the ground position
-    alone is missing."""
-    return query.known_positions | ~query.missing.joints.any(dim=1, keepdim=True)
-
-
-def _shift(loose: LooseKeys, by: Float[Tensor, " 3"]) -> LooseKeys:
-    return replace(loose, ground=loose.ground + by[::2])
-
-
 def keep_feet(
     body: Motion, away: Float[Tensor, "frames 3"], planted: Float[Tensor, "frames 2"], query: GapQuery
 ) -> Motion:
@@ -817,16 +803,3 @@ def keep_feet(
         ends[:, CANONICAL.parents[toe]] += planted[:, foot, None] * away
     wanted = torch.zeros(ends.shape[:2], dtype=torch.bool)
     return bend_limbs(body, body, ends, wanted, query.missing.joints)
-
-
-def load(name: str = "tweener", path: str = "path") -> Tweener:
-    """Load the bundled tweener, or a trained one by its file or run folder, with the path predictor that it was trained
-    with; CheckpointError for anything else, and for another path predictor."""
-    network, card = checkpoints.load_network(name, "tweener", GeneratorNetwork, GeneratorConfig)
-    classes = read_classes(card, network.config.style)
-    wanted, found = card.data.get("path"), checkpoints.compute_hash(path)
-    if wanted != found:
-        raise CheckpointError(
-            f"{name} was trained with the path predictor {str(wanted)[:12]}; {path} is {found}: name it by --path"
-        )
-    return Tweener(name, network, card, path_predictor.load(path), classes=classes)

@@ -8,8 +8,6 @@ in force is that of the environment variable MAPCTL_WEIGHTS, which reaches proce
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from importlib.resources import as_file, files
-from importlib.resources.abc import Traversable
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -45,9 +43,9 @@ def use_weights(name: str | None) -> Iterator[None]:
     try:
         yield
     finally:
-        if name is not None and before is not None:
+        if before is not None:
             os.environ[VARIABLE] = before
-        elif name is not None:
+        else:
             os.environ.pop(VARIABLE, None)
 
 
@@ -59,9 +57,7 @@ def _check(name: str, what: str) -> str:
 
 def list_models(weights: str | None = None) -> list[str]:
     """List the names of a set's models, without the set; of the set in force if none is named."""
-    found = _find_folder(weights or find_current_set())
-    names = (each.name for each in found.iterdir()) if found.is_dir() else ()
-    return sorted(name.removesuffix(_ENDING) for name in names if name.endswith(_ENDING))
+    return sorted(file.stem for file in _find_folder(weights or find_current_set()).glob(f"*{_ENDING}"))
 
 
 def split_name(name: str) -> tuple[str, str]:
@@ -78,14 +74,10 @@ def means_bundled(name: str) -> bool:
 
 
 def find_file(name: str) -> Path | None:
-    """Find the file of a bundled name, with or without a set in it, or of the model that stands in for it; None where
-    the set has neither."""
+    """Find the file of a bundled name, with or without its set, or of what stands in for it; None without either."""
     weights, model = split_name(name)
     found = _find_model(weights, model)
-    if found is None:
-        return None
-    with as_file(_find_folder(weights) / f"{found}{_ENDING}") as path:
-        return path
+    return None if found is None else _find_folder(weights) / f"{found}{_ENDING}"
 
 
 def _find_model(weights: str, model: str) -> str | None:
@@ -96,11 +88,8 @@ def _find_model(weights: str, model: str) -> str | None:
 
 def find_set_of(path: Path) -> str | None:
     """Find the set that a file is of; None for files that are not bundled."""
-    for weights in SETS:
-        with as_file(_find_folder(weights)) as folder:
-            if path.resolve().parent == folder.resolve():
-                return weights
-    return None
+    folder = path.resolve().parent
+    return next((weights for weights in SETS if _find_folder(weights).resolve() == folder), None)
 
 
 def add_set(name: str) -> str:
@@ -128,9 +117,9 @@ def explain_missing(name: str) -> CheckpointError:
     return CheckpointError(f"the {weights} weights have no {model!r}: {held}{other}")
 
 
-def _find_folder(weights: str) -> Traversable:
+def _find_folder(weights: str) -> Path:
     own = os.environ.get(FOLDER_VARIABLE)
-    whole: Traversable = Path(own) if own else files("priors.weights")
+    whole = Path(own) if own else Path(__file__).with_name("weights")
     return whole if weights == SETS[0] else whole / weights
 
 

@@ -216,7 +216,7 @@ def tiny_density(
     found = select_initial_states(model, data, count=starts, generator=generator(seed))
     limits, names = measure_data_limits(data), {"starts": list(found.names)}
     shape, shown = model.config.as_card(), asdict(limits)
-    card = Card("lstm-gmm", shape, licence="none", data=names, abilities=shown, **Card.layout_fields())
+    card = Card("lstm-gmm", shape, licence="none", data=names, abilities=shown)
     fast = dtype is torch.float32
     density = LstmGmmDensity("tiny", model.to(dtype), found, limits, card, use_fast=fast)
     if dtype is not torch.float32:

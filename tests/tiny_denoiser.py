@@ -3,12 +3,12 @@
 from pathlib import Path
 
 import torch
+from tiny_files import make_card, save_model
 
 from controllers.common.map_refinement import RefinementSettings
 from controllers.denoising.denoise import DenoiseSettings
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
-from priors import checkpoints
 from priors.denoiser import ConvDenoiser, DenoiserConfig, DenoiserNetwork
 
 QUICK = DenoiseSettings(
@@ -30,20 +30,11 @@ def network(*, drawn: float = 0.0, seed: int = 0, config: DenoiserConfig = CONFI
     return result.eval().requires_grad_(False)
 
 
-def card() -> checkpoints.Card:
-    """Card of the tiny denoiser."""
-    return checkpoints.Card(
-        "denoiser", CONFIG.as_card(), licence="none, it is made up", **checkpoints.Card.layout_fields()
-    )
-
-
 def tiny_denoiser(*, drawn: float = 0.0, seed: int = 0) -> ConvDenoiser:
     """As the controllers take it."""
-    return ConvDenoiser("tiny", network(drawn=drawn, seed=seed), card())
+    return ConvDenoiser("tiny", network(drawn=drawn, seed=seed), make_card("denoiser", CONFIG))
 
 
 def save_tiny_denoiser(path: Path, *, drawn: float = 0.0) -> Path:
     """Write the weights and the card; returns the path for --denoiser."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    checkpoints.save(network(drawn=drawn).state_dict(), card(), path)
-    return path
+    return save_model(tiny_denoiser(drawn=drawn), path)

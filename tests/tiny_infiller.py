@@ -3,11 +3,11 @@
 from pathlib import Path
 
 import torch
+from tiny_files import make_card, save_model
 
 from mapctl import kinematics
 from mapctl.inbetweening import PositionImage
 from mapctl.skeleton import CANONICAL
-from priors import checkpoints
 from priors.infiller import ConvInfiller, InfillerConfig, InfillerNetwork
 
 CONFIG = InfillerConfig(widths=(8, 8, 8, 8, 8))
@@ -26,23 +26,14 @@ def network(*, drawn: float = 0.0, seed: int = 0, config: InfillerConfig = CONFI
     return result.eval().requires_grad_(False)
 
 
-def card(config: InfillerConfig = CONFIG) -> checkpoints.Card:
-    """Card of the tiny infiller."""
-    return checkpoints.Card(
-        "infiller", config.as_card(), licence="none, it is made up", **checkpoints.Card.layout_fields()
-    )
-
-
 def tiny_infiller(*, drawn: float = 0.0, seed: int = 0, config: InfillerConfig = CONFIG) -> ConvInfiller:
     """As the controllers take it."""
-    return ConvInfiller("tiny", network(drawn=drawn, seed=seed, config=config), card(config))
+    return ConvInfiller("tiny", network(drawn=drawn, seed=seed, config=config), make_card("infiller", config))
 
 
 def save_tiny_infiller(path: Path, *, drawn: float = 0.0, config: InfillerConfig = CONFIG) -> Path:
     """Write the weights and the card; returns the path for --inbetweener."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    checkpoints.save(network(drawn=drawn, config=config).state_dict(), card(config), path)
-    return path
+    return save_model(tiny_infiller(drawn=drawn, config=config), path)
 
 
 def shown(motion, known=None, *, present=None, contacts=None):

@@ -4,13 +4,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from tiny_files import make_card, save_model
 
 from mapctl import contacts
 from mapctl.features import LAYOUT, encode
 from mapctl.inbetweening.root_trajectory import LocalMotion, RootTrajectory
 from mapctl.motion import Motion
 from mapctl.protocols import PathPredictor
-from priors import checkpoints
 from priors.path import ConvPathPredictor, PathConfig, PathNetwork
 
 CONFIG = PathConfig(width=4)
@@ -23,27 +23,14 @@ def network(config: PathConfig = CONFIG, *, seed: int = 0) -> PathNetwork:
         return PathNetwork(config).eval().requires_grad_(False)
 
 
-def card(held_out: dict[str, list[str]] | None = None) -> checkpoints.Card:
-    """Card of the tiny path predictor."""
-    return checkpoints.Card(
-        "path",
-        CONFIG.as_card(),
-        licence="none, it is made up",
-        data={"held_out": held_out or {}},
-        **checkpoints.Card.layout_fields(),
-    )
-
-
-def tiny_path(*, seed: int = 0) -> ConvPathPredictor:
+def tiny_path(held_out: dict[str, list[str]] | None = None, *, seed: int = 0) -> ConvPathPredictor:
     """As the controllers take it."""
-    return ConvPathPredictor("tiny", network(seed=seed), card())
+    return ConvPathPredictor("tiny", network(seed=seed), make_card("path", CONFIG, held_out=held_out or {}))
 
 
 def save_tiny_path(path: Path, held_out: dict[str, list[str]] | None = None) -> Path:
     """Write the weights and the card; returns the path for --path."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    checkpoints.save(network().state_dict(), card(held_out), path)
-    return path
+    return save_model(tiny_path(held_out), path)
 
 
 @dataclass(frozen=True, eq=False)

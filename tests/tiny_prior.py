@@ -45,7 +45,6 @@ def save_tiny_prior(
         data={"starts": [f"start {number}" for number in range(starts)], "held_out": dict(held_out or {})},
         quality={"mocap": {"sway_cm": {"mean": 1.9, "p2": 1.2, "p98": 2.6}}},
         abilities=asdict(ABILITIES),
-        **checkpoints.Card.layout_fields(),
     )
     checkpoints.save(tensors, card, path)
     return path

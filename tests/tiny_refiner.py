@@ -4,8 +4,8 @@ from functools import cache
 
 import torch
 from helpers import corpus
+from tiny_files import make_card
 
-from priors import checkpoints
 from priors.refiner import LstmRefiner, RefinerConfig, RefinerNetwork, count_channels
 
 TINY = RefinerConfig(width=6, memory=5, lookahead=2, joints=("hips", "leftHand", "rightToes"))
@@ -32,5 +32,5 @@ def network_of(config=TINY, *, trained=True, scale=1.0):
 
 
 def refiner_of(config=TINY, **how):
-    card = checkpoints.Card("refiner", config.as_card(), licence="none", **checkpoints.Card.layout_fields())
+    card = make_card("refiner", config)
     return LstmRefiner("tiny", network_of(config, **how), card)

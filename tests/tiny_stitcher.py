@@ -3,9 +3,9 @@
 from pathlib import Path
 
 import torch
+from tiny_files import make_card, save_model
 
 from mapctl.features import LAYOUT
-from priors import checkpoints
 from priors.stitcher import Stitcher, StitcherConfig, StitcherNetwork
 
 CONFIG = StitcherConfig(
@@ -34,27 +34,11 @@ def network(config: StitcherConfig = CONFIG, *, drawn: float = 0.3, seed: int = 
     return result.eval().requires_grad_(False)
 
 
-def card(config: StitcherConfig = CONFIG) -> checkpoints.Card:
-    """Card of such weights."""
-    return checkpoints.Card(
-        kind="stitcher",
-        config=config.as_card(),
-        licence="free",
-        data={},
-        training={},
-        quality={},
-        abilities={},
-        **checkpoints.Card.layout_fields(),
-    )
-
-
 def save_tiny_stitcher(path: Path, *, drawn: float = 0.3) -> Path:
     """Write the weights and the card; returns the path for --stitcher."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    checkpoints.save(network(drawn=drawn).state_dict(), card(), path)
-    return path
+    return save_model(tiny_stitcher(drawn=drawn), path)
 
 
 def tiny_stitcher(config: StitcherConfig = CONFIG, *, drawn: float = 0.3) -> Stitcher:
     """As controllers take it."""
-    return Stitcher("tiny", network(config, drawn=drawn), card(config))
+    return Stitcher("tiny", network(config, drawn=drawn), make_card("stitcher", config))

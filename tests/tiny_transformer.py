@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import torch
+from tiny_files import make_card, save_model
 
-from priors import checkpoints
 from priors.pose_transformer import PoseTransformer, PoseTransformerConfig, PoseTransformerNetwork
 
 CONFIG = PoseTransformerConfig(width=16, layers=1, heads=2, kernel=3)
@@ -23,20 +23,11 @@ def network(*, drawn: float = 0.0, seed: int = 0, config: PoseTransformerConfig 
     return result.eval().requires_grad_(False)
 
 
-def card(config: PoseTransformerConfig = CONFIG) -> checkpoints.Card:
-    """Card of the tiny transformer."""
-    return checkpoints.Card(
-        "pose-transformer", config.as_card(), licence="none, it is made up", **checkpoints.Card.layout_fields()
-    )
-
-
 def tiny_transformer(*, drawn: float = 0.0, seed: int = 0) -> PoseTransformer:
     """As the controllers take it."""
-    return PoseTransformer("tiny", network(drawn=drawn, seed=seed), card())
+    return PoseTransformer("tiny", network(drawn=drawn, seed=seed), make_card("pose-transformer", CONFIG))
 
 
 def save_tiny_transformer(path: Path, *, drawn: float = 0.0) -> Path:
     """Write the weights and the card; returns the path for --inbetweener."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    checkpoints.save(network(drawn=drawn).state_dict(), card(), path)
-    return path
+    return save_model(tiny_transformer(drawn=drawn), path)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import tiny_path
 import torch
+from tiny_files import make_card
 from torch import Tensor
 
 from mapctl.motion_dna import MotionDna
@@ -30,17 +31,8 @@ def card(
 ) -> checkpoints.Card:
     """Card of the tiny tweener, trained with the path predictor of this hash, with invented classes."""
     members = {name: [MotionDna(_draw_poses(name))] for name in classes}
-    return checkpoints.Card(
-        "tweener",
-        CONFIG.as_card(),
-        licence="none, it is made up",
-        data={
-            "path": path,
-            "held_out": held_out or {},
-            **(encode_classes(network().style, members) if classes else {}),
-        },
-        **checkpoints.Card.layout_fields(),
-    )
+    encoded = encode_classes(network().style, members) if classes else {}
+    return make_card("tweener", CONFIG, path=path, held_out=held_out or {}, **encoded)
 
 
 def tiny_tweener(*, seed: int = 0, path: PathPredictor | None = None) -> Tweener:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from tiny_denoiser import save_tiny_denoiser
+from tiny_files import make_card
 from tiny_path import save_tiny_path
 from tiny_prior import save_tiny_prior
 from tiny_refiner import refiner_of
@@ -62,7 +63,4 @@ def change_card(path: Path, **changes: Any) -> None:
 
 def _save_timing(path: Path) -> None:
     network = KeyframeTimingNetwork(KeyframeTimingConfig())
-    card = checkpoints.Card(
-        "keyframe-timing", network.config.as_card(), licence=FREE, **checkpoints.Card.layout_fields()
-    )
-    checkpoints.save(network.state_dict(), card, path)
+    checkpoints.save(network.state_dict(), make_card("keyframe-timing", network.config), path)

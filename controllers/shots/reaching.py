@@ -21,7 +21,6 @@ from mapctl.curves.obstacles import measure_clearance
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS, GroundPose
 from mapctl.inbetweening.effector_targets import EffectorTargets
-from mapctl.inbetweening.missing import MissingMask
 from mapctl.inbetweening.partial_motion import mirror_quats
 from mapctl.kinematics.inverse import bend_within, find_out, lead_about
 from mapctl.kinematics.moving import measure_look_angle, turn_head
@@ -30,6 +29,7 @@ from mapctl.numerics.easing import smootherstep
 from mapctl.numerics.intervals import true_intervals, widen
 from mapctl.pose import decode
 from mapctl.protocols import Density, Inbetweener
+from mapctl.recording.masks import MissingMask
 from mapctl.skeleton import CANONICAL, FEET, LIMBS, TOES, Skeleton
 from mapctl.terms.keep_clear import WithinReach
 

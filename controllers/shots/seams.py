@@ -20,11 +20,11 @@ from controllers.shots.trajectory import Span, Trajectory
 from controllers.shots.walk import Piece
 from mapctl import contacts
 from mapctl.features import PRIOR_FPS
-from mapctl.inbetweening.missing import MissingMask
 from mapctl.metrics import body
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
 from mapctl.protocols import Inbetweener
+from mapctl.recording.masks import MissingMask
 from mapctl.skeleton import CANONICAL, TOES
 
 _CONTEXT = 16  # frames on either side that the in-betweener is given

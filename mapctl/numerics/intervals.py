@@ -52,3 +52,12 @@ def last_observed(observed: Bool[Tensor, "batch frames"]) -> Int[Tensor, "batch 
 def next_observed(observed: Bool[Tensor, "batch frames"]) -> Int[Tensor, "batch frames"]:
     """Return for each frame the first observed one at or after it; after the last of them, that one."""
     return observed.shape[1] - 1 - last_observed(observed.flip(1)).flip(1)
+
+
+def count_frames_to_observed(observed: Bool[Tensor, "batch frames"]) -> Float[Tensor, "batch frames 2"]:
+    """Count for each frame those since an observed one and those until the next; infinite where there is none."""
+    frame = torch.arange(observed.shape[1], device=observed.device)
+    away = torch.stack([frame - last_observed(observed), next_observed(observed) - frame], dim=-1).float()
+    none = ~observed.any(dim=1)
+    # Before the first observed frame the last one is none, and vice versa.
+    return torch.where(none[:, None, None] | (away < 0), torch.inf, away)

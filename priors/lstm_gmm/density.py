@@ -59,11 +59,6 @@ class Labels:
         return Labels(names, held)
 
 
-def read_clip_labels(clip: str, pattern: str) -> set[str]:
-    """Parse the labels in one clip's name; none where the pattern is empty or does not match."""
-    return _parse_match(re.search(pattern, clip)) if pattern else set()
-
-
 def read_labels(clips: Sequence[str], pattern: str) -> Labels:
     """Read labels from clips' names by the named groups of a regular expression; an empty pattern reads none.
 
@@ -129,6 +124,25 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
     unconditioned: "LstmGmmDensity | None" = None
     """Density of which this is a conditioned copy: both read the same packed weights."""
 
+    @staticmethod
+    def load(name: str) -> "LstmGmmDensity":
+        """Load a bundled prior, or a trained one by its file or run folder; CheckpointError for anything else."""
+        with checkpoints.open_checkpoint(name, "lstm-gmm", called="density") as (tensors, card):
+            starts = InitialStates(
+                LstmState(*(tensors.pop(f"starts.{part}") for part in ("previous", "hidden", "cell"))),
+                tensors.pop("starts.speed"),
+                tuple(card.data["starts"]),
+                tensors.pop("starts.weight"),
+            )
+            config, count = LstmGmmConfig.of_card(card.config), len(starts.names)
+            given = [tuple(each.shape) for each in (*vars(starts.state).values(), starts.speed, starts.weight)]
+            if not count or given != [(count, LAYOUT.size), *[(2, count, config.width)] * 2, (count,), (count,)]:
+                raise RequestError(f"its initial states are not those of {count} clips")
+            network = checkpoints.build_network(LstmGmm, config, tensors)
+            density = LstmGmmDensity(name, network, starts, DataLimits(**card.abilities), card)
+            _ = density.pace_rates, density.reference_log_density  # raise what is wrong with the card's figures
+        return density
+
     @cached_property
     def _fast(self) -> FastRollout:
         """The kernels, built on first use."""
@@ -184,13 +198,13 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
         return replace(self._with_network(self.reference.conditioned_on(full)), initial_states=picked)
 
     def conditioned_like_start(self, start: int) -> "LstmGmmDensity":
-        """Return the density given the labels of the clip that an initial state, of the index `start`, was taken from:
-        its gait goes on."""
+        """Return the density given the labels of the clip of the initial state `start`: its gait goes on."""
         return self.conditioned_like_clip(self.initial_states.names[start])
 
     def conditioned_like_clip(self, name: str) -> "LstmGmmDensity":
         """Return the density conditioned on the labels in a clip's path, of those that it has."""
-        given = read_clip_labels(name, self.card.data.get("labels", ""))
+        pattern = self.card.data.get("labels", "")
+        given = _parse_match(re.search(pattern, name)) if pattern else set()
         known = sorted(given & {*self.reference.config.labels})
         return self._with_network(self.reference.conditioned_on(known))
 
@@ -312,23 +326,3 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
     ) -> tuple[DiscreteChoices, PreparedRollout]:
         """Plan along the rollout of a search's first noise, and prepare rollouts under that plan."""
         return self._fast.plan_window(state, noise) if self.use_fast else super().plan_search(state, noise)
-
-
-def load(name: str) -> LstmGmmDensity:
-    """Load a bundled prior by name, or a trained one by its file or run folder; CheckpointError if there is none."""
-    with checkpoints.open_checkpoint(name, "lstm-gmm", called="density") as (tensors, card):
-        starts = InitialStates(
-            LstmState(*(tensors.pop(f"starts.{part}") for part in ("previous", "hidden", "cell"))),
-            tensors.pop("starts.speed"),
-            tuple(card.data["starts"]),
-            tensors.pop("starts.weight"),
-        )
-        config, count = LstmGmmConfig.of_card(card.config), len(starts.names)
-        shapes = [(count, LAYOUT.size), *[(2, count, config.width)] * 2, (count,), (count,)]
-        if not count or [tuple(t.shape) for t in (*vars(starts.state).values(), starts.speed, starts.weight)] != shapes:
-            raise RequestError(f"its initial states are not those of {count} clips")
-        statistics = {part: tensors[part] for part in ("mean", "std")}
-        model = checkpoints.build_network(LstmGmm, config, tensors, **statistics)
-        density = LstmGmmDensity(name, model, starts, DataLimits(**card.abilities), card)
-        _ = density.pace_rates, density.reference_log_density  # raise what is wrong with the card's figures
-    return density

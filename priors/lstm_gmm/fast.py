@@ -681,7 +681,8 @@ class FastRollout:
         if plan.component.amin() < 0 or plan.component.amax() >= count:
             raise ValueError(f"the plan names a component outside 0 to {count - 1}")
         rows = pad_batch_size(batch)
-        choices = ChoiceBuffers(*(_pad_rows(each.numpy(), rows) for each in vars(plan).values()), _NO_UNIFORM)
+        component, contacts = (_pad_rows(each.numpy(), rows) for each in (plan.component, plan.contacts))
+        choices = ChoiceBuffers(component, contacts, _NO_UNIFORM)
         return FastWindow(self, state, choices, batch, keeps=keeps)
 
     def plan_window(
@@ -694,8 +695,7 @@ class FastRollout:
 
 
 class FastWindow(PreparedRollout):
-    """Rollouts of a window under one plan, one after the other, in the same memory; rows beyond the batch are
-    padding."""
+    """Rollouts of a window under one plan, in the same memory; rows beyond the batch are padding."""
 
     def __init__(self, fast: FastRollout, state: LstmState, choices: ChoiceBuffers, batch: int, *, keeps: bool = True):
         """Allocate for a batch from a state. Only a pullback needs that the tape `keeps` every frame's activations;
@@ -717,8 +717,9 @@ class FastWindow(PreparedRollout):
             np.empty((rows, frames, LAYOUT.size), np.float32),
             np.empty((rows, frames), np.float32),
         )
-        self._d_features, self._d_density = np.zeros_like(self._features), np.zeros_like(self._density)
-        self._d_noise = np.empty_like(self._noise)
+        if keeps:
+            self._d_features, self._d_density = np.zeros_like(self._features), np.zeros_like(self._density)
+            self._d_noise = np.empty_like(self._noise)
         self._rolled = False
 
     def plan(self, noise: Float[Tensor, "batch frames continuous"]) -> DiscreteChoices:

@@ -132,14 +132,10 @@ class LstmState(DensityState):
 class Mixture:
     """Distribution of the next frame, normalised units."""
 
-    log_weight: Float[Tensor, "*batch components"]
-    """Log mixture weights, normalised to sum to one."""
-    mean: Float[Tensor, "*batch components continuous"]
-    """Means."""
-    log_sigma: Float[Tensor, "*batch components continuous"]
-    """Log standard deviations."""
-    contact_logit: Float[Tensor, "*batch 2"]
-    """Contact logits of the left and right toe."""
+    log_weight: Float[Tensor, "*batch components"]  # log mixture weights, normalised to sum to one
+    mean: Float[Tensor, "*batch components continuous"]  # means
+    log_sigma: Float[Tensor, "*batch components continuous"]  # log standard deviations
+    contact_logit: Float[Tensor, "*batch 2"]  # contact logits of the left and right toe
 
     def log_prob(
         self,
@@ -170,11 +166,17 @@ class LstmGmm(nn.Module):
     std: Tensor
     blur: Tensor | None
 
-    def __init__(self, config: LstmGmmConfig, *, mean: Float[Tensor, " size"], std: Float[Tensor, " size"]):
+    def __init__(
+        self,
+        config: LstmGmmConfig,
+        *,
+        mean: Float[Tensor, " size"] | None = None,
+        std: Float[Tensor, " size"] | None = None,
+    ):
         super().__init__()
         self.config = config
-        self.register_buffer("mean", mean.clone())
-        self.register_buffer("std", std.clone())
+        self.register_buffer("mean", torch.zeros(LAYOUT.size) if mean is None else mean.clone())
+        self.register_buffer("std", torch.ones(LAYOUT.size) if std is None else std.clone())
         self.register_buffer("blur", None)
         width, outputs = config.width, config.components * (1 + 2 * LAYOUT.continuous) + 2
         self.fc1, self.fc2 = nn.Linear(LAYOUT.size, width), nn.Linear(width, width)

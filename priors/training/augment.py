@@ -16,14 +16,12 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.features import LAYOUT, GroundPose, encode
-from mapctl.inbetweening.partial_motion import PartialMotion
 from mapctl.kinematics import chain_matrices
 from mapctl.motion import Motion
 from mapctl.pose import BodyPose
 from mapctl.recording import Capture
 from mapctl.retarget.carry import fit_hips, lower_hips, reach_ankle_targets
 from mapctl.retarget.character import FEET, LEGS, TOES, limb_extension
-from mapctl.rotations import to_rotation_vector
 from mapctl.skeleton import CANONICAL
 from priors.training.data import Corpus
 from priors.training.windows import PoseWindows
@@ -82,6 +80,10 @@ class Draws:
         limb, order = self.limb(), self.uniform(CANONICAL.num_joints).argsort(dim=1).argsort(dim=1)
         some = order < (1 + self.uniform(1) * 3).floor()
         return torch.where(self.uniform(1) < 1 - limbs, some, limb)
+
+    def stretch(self, length: Float[Tensor, " batch"]) -> Bool[Tensor, "batch frames"]:
+        """One run of so many frames, that may reach beyond the window's ends."""
+        return self.mark(self.uniform() * (self.frames + 8 - length).clamp_min(1) - 4, length)
 
     def mark(self, start: Tensor, length: Tensor) -> Bool[Tensor, "batch frames"]:
         """True from each start on for so many frames."""
@@ -153,29 +155,20 @@ def corrupt(clean: Capture, generator: torch.Generator) -> Capture:
 class _Noise:
     """How noisy each window of a batch is."""
 
-    angle: Float[Tensor, "batch joints"]
-    """Sigma of each of a joint's angles, radians; 0 where positions are noisy."""
-    root: Float[Tensor, " batch"]
-    """Sigma of each coordinate of the hips, metres; 0 where positions are noisy."""
-    position: Float[Tensor, " batch"]
-    """Sigma of each coordinate of every joint's position, metres; 0 where angles are noisy."""
-    stays: Float[Tensor, " batch"]
-    """Share of the noise that comes from the frame before."""
-    given_angle: Float[Tensor, "batch joints"]
-    """Noise of angles that the network is given, radians."""
-    given_root: Float[Tensor, " batch"]
-    """Noise of the hips' position that the network is given, metres."""
+    angle: Float[Tensor, "batch joints"]  # sigma of each of a joint's angles, radians; 0 where positions are noisy
+    root: Float[Tensor, " batch"]  # sigma of each coordinate of the hips, metres; 0 where positions are noisy
+    position: Float[Tensor, " batch"]  # sigma of each coordinate of every joint, metres; 0 where angles are noisy
+    stays: Float[Tensor, " batch"]  # share of the noise that comes from the frame before
+    given_angle: Float[Tensor, "batch joints"]  # noise of angles that the network is given, radians
+    given_root: Float[Tensor, " batch"]  # noise of the hips' position that the network is given, metres
 
 
 _MAX_NOISE_RAD = 0.6  # radians of noise; more is no noise but another motion
 
 
-def _bone_lengths() -> Float[Tensor, " joints"]:
-    """From each canonical joint to the next, metres; of the last ones, the bone before."""
-    lengths = CANONICAL.offsets.norm(dim=-1).float()
-    return torch.stack(
-        [lengths[below[0]] if (below := CANONICAL.children(joint)) else lengths[joint] for joint in range(_JOINTS)]
-    )
+_LENGTHS = CANONICAL.offsets.norm(dim=-1).float()
+_BONES = torch.stack([_LENGTHS[next(iter(CANONICAL.children(joint)), joint)] for joint in range(_JOINTS)])
+"""From each canonical joint to the next, metres; of the last ones, the bone before."""
 
 
 def _sample_noise(draw: Draws) -> _Noise:
@@ -196,7 +189,7 @@ def _sample_noise(draw: Draws) -> _Noise:
 
 def _angles_of_positions(position: Float[Tensor, " batch"]) -> Float[Tensor, "batch joints"]:
     """Noise of a joint's angles about its parent where both bones point from one noisy position to another, radians."""
-    own = (math.sqrt(2) * position[:, None] / _bone_lengths().to(position)).clamp(max=_MAX_NOISE_RAD)
+    own = (math.sqrt(2) * position[:, None] / _BONES.to(position)).clamp(max=_MAX_NOISE_RAD)
     own = own * torch.tensor([bool(CANONICAL.children(joint)) for joint in range(_JOINTS)])
     above = own[:, [max(0, parent) for parent in CANONICAL.parents]].clone()
     above[:, 0] = 0.0
@@ -215,8 +208,7 @@ def _estimated_share(stays: Float[Tensor, " batch"]) -> Float[Tensor, " batch"]:
 def _perturb_positions(
     quats: Float[Tensor, "batch frames joints 4"], root: Float[Tensor, "batch frames 3"], noise: _Noise, draw: Draws
 ) -> tuple[Tensor, Tensor]:
-    """Turn the bones of windows whose positions are noisy from each noisy joint to the first one below, and move the
-    hips by their own noise."""
+    """Turn the bones of windows with noisy positions from each joint to the first one below, and move the hips."""
     rows = noise.position.nonzero()[:, 0]
     if len(rows) == 0:
         return quats, root
@@ -290,8 +282,7 @@ _TEMPO, _STRIDES = 0.15, 0.1  # largest changes of a copy's tempo and strides, a
 
 
 def add_copies(corpus: Corpus, count: int, generator: torch.Generator) -> Corpus:
-    """Return a corpus with its clips, and after them so many copies of each, under the same names, with another tempo
-    and other strides."""
+    """Return a corpus with so many copies of each clip after it, under the same names, at other tempos and strides."""
     if count == 0:
         return corpus
     windows = PoseWindows(corpus, evenness=0.0)
@@ -314,7 +305,9 @@ def copy_clip(windows: PoseWindows, number: int, *, tempo: float, strides: float
     clip = torch.tensor([number])
     frames = int((int(windows.lengths[number]) - 1) / tempo) + 1
     played = windows.at(clip, torch.zeros_like(clip), frames, torch.tensor([tempo]))
-    features = encode(change_strides(_as_motion(played), strides))[0].float()
+    vectors = rotations.to_rotation_vector(played.quats[0].double())
+    pose = BodyPose(played.root_position[0].double(), played.heading[0].double(), vectors[:, 0, ::2], vectors[:, 1:])
+    features = encode(change_strides(pose.motion(), strides))[0].float()
     time = tempo * torch.arange(frames)
     bits = windows.contacts.split(windows.lengths.tolist())[number]
     features[:, LAYOUT.slices["contacts"]] = bits[time.floor().long()] * bits[time.ceil().long()]
@@ -336,10 +329,3 @@ def change_strides(motion: Motion, factor: float) -> Motion:
     moved = replace(motion, root_position=scale * motion.root_position)
     moved = lower_hips(fit_hips(moved, ankles, stretch), ankles, stretch)
     return reach_ankle_targets(moved, ankles)
-
-
-def _as_motion(played: PartialMotion) -> Motion:
-    """The first of a batch of motions of which everything is known."""
-    vectors = to_rotation_vector(played.quats[0].double())
-    pose = BodyPose(played.root_position[0].double(), played.heading[0].double(), vectors[:, 0, ::2], vectors[:, 1:])
-    return pose.motion()

@@ -118,9 +118,9 @@ def moment_loss(
     ours, theirs = _Moments.of(generated), _Moments.of(real)
     # Feet may be stiller than mocap's, not looser.
     feet = sum(_log_ratio(a, b).clamp(min=0).square() for a, b in zip(ours.feet, theirs.feet, strict=True))
-    pace = torch.stack(
-        [_log_ratio(generated_, real_).mean() for generated_, real_ in _pair_by_pace(ours.pace, theirs.pace)]
-    )
+    # The slowest quarter of the windows with mocap's slowest, and so on: walks must not make up for slow runs.
+    quarters = zip(*(each.pace.sort().values.chunk(4) for each in (ours, theirs)), strict=True)
+    pace = torch.stack([_log_ratio(one, other).mean() for one, other in quarters])
     return (
         weights.feet * feet
         + weights.jerk * _log_ratio(ours.jerk, theirs.jerk).square().mean()
@@ -135,18 +135,12 @@ def moment_loss(
 class _Moments:
     """Moments of a batch of windows; each with a floor that keeps logarithms of stillness finite."""
 
-    feet: tuple[Tensor, Tensor]
-    """Mean squared horizontal speed (m^2/s^2) and height error (m^2) of planted toes."""
-    jerk: Float[Tensor, " joints"]
-    """Mean jerk of each joint, m/s^3."""
-    pace: Float[Tensor, " batch"]
-    """Mean ground speed of each window, m/s."""
-    spread: Float[Tensor, " size"]
-    """Standard deviation of each feature over batch and frames."""
-    change: Float[Tensor, " size"]
-    """Mean change of each feature from frame to frame."""
-    late: Float[Tensor, " size"]
-    """Mean of each feature over the second half of the frames."""
+    feet: tuple[Tensor, Tensor]  # mean squared horizontal speed (m^2/s^2) and height error (m^2) of planted toes
+    jerk: Float[Tensor, " joints"]  # mean jerk of each joint, m/s^3
+    pace: Float[Tensor, " batch"]  # mean ground speed of each window, m/s
+    spread: Float[Tensor, " size"]  # standard deviation of each feature over batch and frames
+    change: Float[Tensor, " size"]  # mean change of each feature from frame to frame
+    late: Float[Tensor, " size"]  # mean of each feature over the second half of the frames
 
     @staticmethod
     def of(features: Float[Tensor, "batch frames size"]) -> "_Moments":
@@ -179,11 +173,6 @@ def _log_ratio(ours: Tensor, theirs: Tensor) -> Tensor:
     return torch.log(ours) - torch.log(theirs)
 
 
-def _pair_by_pace(ours: Tensor, theirs: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Our slowest quarter of the windows with mocap's slowest, and so on: walks must not make up for slow runs."""
-    return list(zip(ours.sort().values.chunk(4), theirs.sort().values.chunk(4), strict=True))
-
-
 _WIDTH = 128
 _LAYERS = ((3, 1), (5, 2), (5, 2), (3, 1))  # kernel and stride
 _LEAST_STD = 0.01
@@ -214,12 +203,12 @@ class CriticTrainer:
         self.history = HistoryBuffer(self._show_end(generated))
 
     def score(self, generated: Float[Tensor, "batch frames size"], generator: torch.Generator) -> Tensor:
-        """Return the density's loss, whose gradient goes into what generated the motion; and keep the free runs in
-        place of earlier ones."""
+        """Return the density's loss, the negative log probability that its runs are taken for captured (Goodfellow et
+        al. 2014, section 3), whose gradient goes into what generated them; and keep them instead of earlier ones."""
         assert self.history is not None
         shown = self._show_end(generated)
         self.history.keep(shown.detach(), generator)
-        return compute_generator_loss(self.network(shown))
+        return softplus(-self.network(shown)).mean()
 
     def learn(self, step: int, updates: int, generator: torch.Generator) -> dict[str, float]:
         """Take updates on captured motion and what is kept; return the mean loss (1.39 where nothing is known), and the
@@ -229,11 +218,15 @@ class CriticTrainer:
 
     def _update(self, step: int, generator: torch.Generator) -> dict[str, float]:
         assert self.history is not None
-        count = _BATCH
-        real = self._show_captured(count, generator)
-        for_real, for_generated = self.network(real), self.network(self.history.draw(count, generator))
-        loss = compute_critic_loss(for_real, for_generated)
-        total = loss + _PENALTY * compute_gradient_penalty(self.network, real)
+        real = self._show_captured(_BATCH, generator)
+        for_real, for_generated = self.network(real), self.network(self.history.draw(_BATCH, generator))
+        # Cross entropy of both answers (Goodfellow et al. 2014, Eq. 1), and the mean squared slope of the critic at
+        # captured motion, by standard deviations (R1 of Mescheder et al. 2018).
+        loss = softplus(-for_real).mean() + softplus(for_generated).mean()
+        standard = self.network.standardise(real).detach().requires_grad_()
+        answer = self.network.score_standardised(standard).sum()
+        (slope,) = torch.autograd.grad(answer, standard, create_graph=True)
+        total = loss + _PENALTY * slope.square().flatten(1).sum(dim=1).mean()
         self.optimiser.zero_grad(set_to_none=True)
         total.backward()
         if not math.isfinite(float(total.detach())):
@@ -293,24 +286,6 @@ def show(features: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch f
     hips, velocity = seen[:, 1:, _HIPS], torch.diff(seen, dim=1) * PRIOR_FPS
     about = seen[:, 1:] - rotations.lift_ground(hips[..., ::2]).unsqueeze(-2)
     return torch.cat([about.flatten(2), velocity.flatten(2), hips], dim=-1)
-
-
-def compute_critic_loss(real: Float[Tensor, " batch"], generated: Float[Tensor, " others"]) -> Tensor:
-    """Cross entropy of both answers in nats; 1.39 where nothing is known (Goodfellow et al. 2014, Eq. 1)."""
-    return softplus(-real).mean() + softplus(generated).mean()
-
-
-def compute_generator_loss(generated: Float[Tensor, " batch"]) -> Tensor:
-    """Negative log probability that a generated window is classified as captured (Goodfellow et al. 2014, section
-    3)."""
-    return softplus(-generated).mean()
-
-
-def compute_gradient_penalty(critic: FreeRunCritic, real: Float[Tensor, "batch frames rows"]) -> Tensor:
-    """Mean squared slope of the critic at captured motion (R1 of Mescheder et al. 2018), by standard deviations."""
-    standard = critic.standardise(real).detach().requires_grad_()
-    (slope,) = torch.autograd.grad(critic.score_standardised(standard).sum(), standard, create_graph=True)
-    return slope.square().flatten(1).sum(dim=1).mean()
 
 
 _FOOT_JOINTS = ("leftFoot", "leftToes", "rightFoot", "rightToes")

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
@@ -42,16 +43,11 @@ MIN_CLIP_FRAMES = 75
 class Corpus:
     """Features of many clips, one after the other."""
 
-    names: tuple[str, ...]
-    """Clip names: the files' paths below the data folder."""
-    lengths: tuple[int, ...]
-    """Frames of each clip."""
-    features: Float[Tensor, "frames size"]
-    """All frames, float32, physical units."""
-    skipped: dict[str, str] = field(default_factory=dict)
-    """Why files of the same folder are not among the clips, by their paths below it."""
-    cuts: tuple[str, ...] = ()
-    """For each table of frames that was used, its name and of how many of the clips it takes a part."""
+    names: tuple[str, ...]  # clip names: the files' paths below the data folder
+    lengths: tuple[int, ...]  # frames of each clip
+    features: Float[Tensor, "frames size"]  # all frames, float32, physical units
+    skipped: dict[str, str] = field(default_factory=dict)  # why files of the folder are not among the clips, by path
+    cuts: tuple[str, ...] = ()  # tables of frames that were used, and of how many clips each takes a part
 
     def identity(self) -> dict[str, str]:
         """Return what distinguishes this corpus: its size, and short hashes of names, lengths and features."""
@@ -62,11 +58,6 @@ class Corpus:
         }
         size = {"clips": str(len(self.names)), "frames": str(len(self.features))}
         return size | {name: sha256(content).hexdigest()[:12] for name, content in hashed.items()}
-
-    def describe_selection(self) -> dict[str, Any]:
-        """Describe, for a card, the files that were left out and the tables of frames, where there are any."""
-        found = {"skipped": dict(self.skipped), "cuts": list(self.cuts)}
-        return {name: value for name, value in found.items() if value}
 
     def clips(self) -> list[Float[Tensor, "frames size"]]:
         """The features of each clip."""
@@ -98,14 +89,10 @@ class Corpus:
 class Split:
     """A corpus and its parts. What is trained on is in no other."""
 
-    whole: Corpus
-    """All clips."""
-    train: Corpus
-    """90 % of the clips."""
-    validation: Corpus
-    """5 %, for the curve."""
-    test: Corpus
-    """5 %, for the measures of the card; of few clips the very part that `validation` is."""
+    whole: Corpus  # all clips
+    train: Corpus  # 90 % of the clips
+    validation: Corpus  # 5 %, for the curve
+    test: Corpus  # 5 %, for the measures of the card; of few clips the very part that `validation` is
 
     def to(self, device: str) -> "Split":
         """All parts on a device of torch's."""
@@ -200,7 +187,9 @@ def read_corpus(
     corpus = _read_cache(stored)
     if corpus is None:
         corpus = _read_files(data, files, tables, level, report)
-        _write_cache(corpus, stored)
+        stored.parent.mkdir(parents=True, exist_ok=True)
+        index = json.dumps([corpus.names, corpus.lengths, corpus.skipped])
+        write_tensors(stored, {"features": corpus.features}, metadata={"index": index})
     used = Counter(table for table, _ in map(tables.find, corpus.names) if table)
     described = tuple(f"{table}: {count} of {len(corpus.names)} clips" for table, count in used.items())
     for line in described:
@@ -269,12 +258,6 @@ def _read_cache(stored: Path) -> Corpus | None:
     return corpus if whole else None
 
 
-def _write_cache(corpus: Corpus, stored: Path) -> None:
-    stored.parent.mkdir(parents=True, exist_ok=True)
-    index = json.dumps([corpus.names, corpus.lengths, corpus.skipped])
-    write_tensors(stored, {"features": corpus.features}, metadata={"index": index})
-
-
 CMU = Path("cmu")
 """The name of the table for takes of the CMU database that comes with mapctl, in place of a file of one's own."""
 _CMU_TABLE = Path(__file__).with_name("cmu_cuts.csv")
@@ -302,8 +285,7 @@ class Cut(NamedTuple):
 
 @dataclass(frozen=True)
 class FrameCuts:
-    """All tables of a data folder: that given with --cuts, then every Frame_Cuts.csv, each for the files beside and
-    below it."""
+    """The tables of a data folder: that of --cuts, then every Frame_Cuts.csv, for the files beside and below it."""
 
     tables: tuple[tuple[str, str, dict[str, Cut]], ...] = ()
     """The folder that each is for, as a path below the data folder, its file's name, and its rows."""
@@ -398,7 +380,12 @@ def stand_on_canonical(motion: Motion, rigmap: RigMap) -> Motion:
     What slopes is turned level as a whole, and each toe then rests as high as the canonical one; hips and steps are in
     the scale of the legs (see `mapctl.retarget.carry`).
     """
-    leveled = _put_on_floor(turn_level(motion, find_floor_slope(motion)))
+    turned = turn_level(motion, find_floor_slope(motion))
+    # Up or down until toes rest about as high as they should: what is far off counts as a platform else.
+    seen = estimate_floor_heights(turned.joint_positions()[:, list(TOE_JOINTS)])
+    root = turned.root_position.clone()
+    root[:, 1] -= (seen - Stance.at_rest(turned.skeleton).toe_height).min()
+    leveled = replace(turned, root_position=root)
     source = RiggedCharacter(rigmap, Stance.of(leveled, rigmap))
     return retarget_canonical(leveled, source, _canonical_body()).motion
 
@@ -450,14 +437,6 @@ def turn_level(motion: Motion, slope: Float[Tensor, "2"]) -> Motion:
     return replace(motion, root_position=root, local_quat_xyzw=local)
 
 
-def _put_on_floor(motion: Motion) -> Motion:
-    """Shift up or down until toes rest about as high as they should: what is far off counts as a platform else."""
-    seen = estimate_floor_heights(motion.joint_positions()[:, list(TOE_JOINTS)])
-    root = motion.root_position.clone()
-    root[:, 1] -= (seen - Stance.at_rest(motion.skeleton).toe_height).min()
-    return replace(motion, root_position=root)
-
-
 @cache
 def _canonical_body() -> RiggedCharacter:
     return RiggedCharacter(identify_rig(CANONICAL), Stance.at_rest(CANONICAL))
@@ -482,22 +461,21 @@ def number_clip_folders(corpus: Corpus) -> Int[Tensor, " clips"]:
     return torch.tensor([number[folder] for folder in folders])
 
 
-def measure_speeds(corpus: Corpus) -> list[Float[Tensor, " frames"]]:
-    """Measure the speeds of the hips over the ground by clip, without the sway within a stride, m/s."""
+def _follow_speeds(corpus: Corpus) -> list[NDArray[np.floating]]:
+    """Follow the speeds of the hips over the ground by clip, without the sway within a stride, m/s."""
     parts = corpus.integrate_roots()[0].split(list(corpus.lengths))
-    return [torch.from_numpy(measure_speed(part.numpy(), PRIOR_FPS)).float() for part in parts]
+    return [measure_speed(part.double().numpy(), PRIOR_FPS) for part in parts]
 
 
 def follow_paces(corpus: Corpus) -> Int[Tensor, " frames"]:
     """Follow the pace of all clips, joined: the index in PACES of each frame."""
-    return torch.cat([torch.from_numpy(follow_pace(speed.numpy())) for speed in measure_speeds(corpus)])
+    return torch.from_numpy(np.concatenate([follow_pace(speed) for speed in _follow_speeds(corpus)]))
 
 
 def measure_pace_changes(corpus: Corpus) -> dict[str, Any]:
     """Measure minutes by pace (stand, walk, run) and how often the clips change from one pace to another, for a card
     (see `priors.lstm_gmm.density`)."""
-    parts = corpus.integrate_roots()[0].split(list(corpus.lengths))
-    speeds = [measure_speed(part.double().numpy(), PRIOR_FPS) for part in parts]
+    speeds = _follow_speeds(corpus)
     pace = np.bincount(np.concatenate([follow_pace(speed) for speed in speeds]), minlength=len(PACES))
     changes = [count_pace_changes(speed) for speed in speeds]
     minutes = {name: round(int(count) / PRIOR_FPS / 60, 2) for name, count in zip(PACES, pace, strict=True)}

@@ -145,7 +145,10 @@ class Settings(ABC):
 
     def find_device(self) -> str:
         """Return `cpu` or `cuda`; RequestError for one that this machine does not have."""
-        return "cpu"
+        asked, there = getattr(self, "device", "cpu"), torch.cuda.is_available()
+        if asked == "cuda" and not there:
+            raise RequestError("this machine has no CUDA device; use --device cpu")
+        return "cuda" if there and asked != "cpu" else "cpu"
 
     @property
     def chosen(self) -> str:
@@ -153,13 +156,16 @@ class Settings(ABC):
         return self.match or ""
 
     @property
-    def split_seed(self) -> int:
-        """Seed by which clips are kept from training."""
-        return self.seed
+    def init_card(self) -> checkpoints.Card | None:
+        """Card of the model with whose weights training begins, if there is one."""
+        name: str | None = getattr(self, "init", None)
+        return None if name is None else checkpoints.read_card(checkpoints.locate(name).with_suffix(".json"))
 
-    def find_origin(self) -> dict[str, dict[str, str]]:
-        """Return the model that training began with and its licence, for a card's data; nothing without one."""
-        return {}
+    @property
+    def split_seed(self) -> int:
+        """Seed by which clips are kept from training: that of the initial weights, where there are any, or the run
+        would train on what their measures hold out."""
+        return self.seed if self.init_card is None else int(self.init_card.data.get("split_seed", self.seed))
 
     def gather(self) -> Split:
         """Read the clips and split them; RUN/skipped.txt lists the files that were left out.
@@ -197,6 +203,8 @@ class NetworkSettings(Settings):
     """Shape of the paper's network, for `paper`."""
     shape_options: ClassVar[tuple[str, ...]] = ()
     """Options that decide the shape of the network."""
+    least_window: ClassVar[int] = 1
+    """Frames that a window must have."""
 
     batch: Count = 64
     """Windows a step."""
@@ -218,7 +226,8 @@ class NetworkSettings(Settings):
 
     def __post_init__(self):
         super().__post_init__()
-        require_at_least(self, 1, "batch", "window")
+        require_at_least(self, 1, "batch")
+        require_at_least(self, self.least_window, "window")
         if not 0 <= self.init_share < 1 or (self.init_share and self.init is None):
             raise RequestError(f"--init-share is from 0 to below 1, and needs --init; got {self.init_share:g}")
         if self.init is not None and any(getattr(self, name, None) for name in self.shape_options):
@@ -232,57 +241,30 @@ class NetworkSettings(Settings):
 
     def find_config(self) -> Any:
         """Return the shape of the network: that of the initial model, where there is one."""
-        asked = self.shape or self.make_config()
-        if self.init is None:
+        asked, card = self.shape or self.make_config(), self.init_card
+        if card is None:
             return asked
-        card = _read_card(self.init)
         if card.kind != self.kind:
             raise CheckpointError(f"{self.init} holds a {card.kind}, not a {self.kind}")
         return type(asked).of_card(card.config)
-
-    def find_device(self) -> str:
-        """Return `cpu` or `cuda`; RequestError for one that this machine does not have."""
-        there = torch.cuda.is_available()
-        if self.device == "cuda" and not there:
-            raise RequestError("this machine has no CUDA device; use --device cpu")
-        return "cuda" if there and self.device != "cpu" else "cpu"
-
-    @property
-    def split_seed(self) -> int:
-        """Seed by which clips are kept from training: that of the initial weights, where there are any, or the run
-        would train on what their measures hold out."""
-        return self.seed if self.init is None else int(_read_card(self.init).data.get("split_seed", self.seed))
-
-    def find_origin(self) -> dict[str, dict[str, str]]:
-        """Return the model that training began with and its licence, for a card's data; nothing without one."""
-        if self.init is None:
-            return {}
-        return {"init": {"name": name_for_records(self.init), "licence": _read_card(self.init).licence}}
 
 
 @dataclass
 class Export:
     """Weights and facts that a finished run writes, beside those of every card."""
 
-    tensors: Mapping[str, Tensor]
-    """Weights, by name."""
-    data: Row = field(default_factory=dict)
-    """Description of its training data, for the card."""
-    quality: Row = field(default_factory=dict)
-    """Measures, for the card."""
-    abilities: dict[str, float] = field(default_factory=dict)
-    """Speeds and turning that the data show."""
-    half: bool = True
-    """Whether weights are kept in float16."""
+    tensors: Mapping[str, Tensor]  # weights, by name
+    data: Row = field(default_factory=dict)  # description of its training data, for the card
+    quality: Row = field(default_factory=dict)  # measures, for the card
+    abilities: dict[str, float] = field(default_factory=dict)  # speeds and turning that the data show
+    half: bool = True  # whether weights are kept in float16
 
 
 class Trainer(ABC, Generic[Network]):
     """A network and what trains it. Everything random comes from one generator."""
 
-    network: Network
-    """The network that is trained."""
-    config: Any
-    """Its shape, a NetworkConfig."""
+    network: Network  # the network that is trained
+    config: Any  # its shape, a NetworkConfig
 
     def __init__(self, settings: Any):
         self.settings, self.step, self.steps = settings, 0, settings.steps
@@ -298,8 +280,7 @@ class Trainer(ABC, Generic[Network]):
 
     @abstractmethod
     def score(self, row: Row) -> float:
-        """Return the one number among measures of held-out clips by which models are ranked, smaller where it is
-        better; NaN without one."""
+        """Return the one measure of held-out clips by which models are ranked, the smaller the better; NaN without."""
 
     @property
     def exported(self) -> Network:
@@ -462,10 +443,18 @@ def train(settings: Settings) -> Path:
     if present and not settings.resume:
         raise RequestError(f"{settings.out} already holds a run; pass --resume to continue, or choose another folder")
     with _join_processes(settings), use_device(settings.find_device()):
-        parts = _read_in_turn(settings.gather)
+        if not is_main():
+            distributed.barrier()  # until the first process has read the clips, and the others find its cache
+        parts = settings.gather()
+        if is_main() and count_processes()[1] > 1:
+            distributed.barrier()
         held = parts.to(torch.get_default_device().type)
         trainer = settings.make_trainer(held)
-        keeps_best, identity = settings.keeps_best or settings.patience > 0, _identify(settings, trainer, parts)
+        keeps_best = settings.keeps_best or settings.patience > 0
+        # What must not change between a run's parts. The number of steps may, and the precision.
+        clips = parts.whole.identity() | {"split seed": settings.split_seed} | trainer.identify()
+        identity = {"settings": _list_settings(settings), "network": trainer.config.as_card(), "data": clips}
+        identity = json.loads(json.dumps(identity))
         best = _copy_weights(trainer.exported) if keeps_best else {}
         curve: list[Row] = []
         if settings.resume:
@@ -488,8 +477,10 @@ def train(settings: Settings) -> Path:
                     settings.report(f"validation at step {trainer.step}: {shown}")
                 else:
                     row = {}
-                row = _send_to_all(row)
-                curve.append({"step": trainer.step, **row})
+                rows = [row]  # the first process' for all
+                if count_processes()[1] > 1:
+                    distributed.broadcast_object_list(rows)
+                curve.append({"step": trainer.step, **rows[0]})
                 scores = [math.inf if math.isnan(score) else score for score in map(trainer.score, curve)]
                 if keeps_best and all(scores[-1] < before for before in scores[:-1]):
                     best = _copy_weights(trainer.exported)
@@ -529,17 +520,19 @@ def train(settings: Settings) -> Path:
 
 
 def _export(
-    settings: Settings, trainer: Trainer[Any], parts: Split, curve: list[Row], stopped: str | None, path: Path
+    settings: Any, trainer: Trainer[Any], parts: Split, curve: list[Row], stopped: str | None, path: Path
 ) -> None:
     """Write the model with its card."""
     for network in trainer.networks().values():
         network.to("cpu")
     trainer.finish()
-    exported, origin = trainer.export(parts), settings.find_origin()
+    exported, init = trainer.export(parts), settings.init_card
+    origin = {} if init is None else {"init": {"name": name_for_records(settings.init), "licence": init.licence}}
     corpus = parts.whole
     data = {
         **corpus.identity(),
-        **corpus.describe_selection(),
+        **({"skipped": dict(corpus.skipped)} if corpus.skipped else {}),
+        **({"cuts": list(corpus.cuts)} if corpus.cuts else {}),
         "match": settings.chosen,
         "split_seed": settings.split_seed,
         "held_out": {"validation": list(parts.validation.names), "test": list(parts.test.names)},
@@ -551,38 +544,31 @@ def _export(
         },
     }
     ended = {} if stopped is None else {"ended": f"step {trainer.step}: {stopped}"}
-    inherited = OF_DATA if not origin else f"{OF_DATA}; {origin['init']['licence']}"
+    inherited = OF_DATA if init is None else f"{OF_DATA}; {init.licence}"
     card = checkpoints.Card(
         kind=settings.kind,
         config=trainer.config.as_card(),
         licence=settings.licence or inherited,
         data=data,
-        training={"settings": _list_settings(settings), "curve": curve, **ended},
+        training={"settings": {"steps": settings.steps, **_list_settings(settings)}, "curve": curve, **ended},
         quality=exported.quality,
         abilities=exported.abilities,
-        **checkpoints.Card.layout_fields(),
     )
     checkpoints.save(dict(exported.tensors), card, path, half=exported.half)
 
 
 def _list_settings(settings: Settings) -> Row:
-    """Return the settings that change what a step does, and the number of steps."""
-    return {name: v for name, v in asdict(settings).items() if name == "steps" or name not in _MAY_CHANGE}
-
-
-def _identify(settings: Settings, trainer: Trainer[Any], parts: Split) -> dict[str, Row]:
-    """Return what must not change between a run's parts. The number of steps may, and the precision."""
-    chosen = {name: value for name, value in _list_settings(settings).items() if name != "steps"}
-    data = parts.whole.identity() | {"split seed": settings.split_seed} | trainer.identify()
-    return json.loads(json.dumps({"settings": chosen, "network": trainer.config.as_card(), "data": data}))
+    """Return the settings that change what a step does."""
+    return {name: value for name, value in asdict(settings).items() if name not in _MAY_CHANGE}
 
 
 def _load_checkpoint(
     settings: Settings, trainer: Trainer[Any], identity: dict[str, Row]
 ) -> tuple[list[Row], dict[str, Tensor]]:
     """Go on from the run folder's checkpoint; return the curve and the best weights so far."""
-    with _explain_unreadable(settings.out):
-        index, tensors = _read_checkpoint(settings.out)
+    with _explain_unreadable(settings.out), safe_open(settings.out / CHECKPOINT, framework="pt") as file:
+        index = json.loads(file.metadata()["run"])
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         for part, now in identity.items():
             then = index["identity"][part]
             if changed := [f"{key}: {then.get(key)} then, {now[key]} now" for key in now if then.get(key) != now[key]]:
@@ -596,16 +582,11 @@ def _load_checkpoint(
 
 def _describe_saved(run: Path) -> str:
     try:
-        with _explain_unreadable(run):
-            return f"step {_read_checkpoint(run)[0]['step']} is saved; the same command with --resume goes on"
+        with _explain_unreadable(run), safe_open(run / CHECKPOINT, framework="pt") as file:
+            step = json.loads(file.metadata()["run"])["step"]
+            return f"step {step} is saved; the same command with --resume goes on"
     except CheckpointError:
         return "nothing was saved yet"
-
-
-def _read_checkpoint(run: Path) -> tuple[Row, dict[str, Tensor]]:
-    with safe_open(run / CHECKPOINT, framework="pt") as file:
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        return json.loads(file.metadata()["run"]), tensors
 
 
 @contextmanager
@@ -637,8 +618,9 @@ class Log:
         finite = {name: value for name, value in _finite(values).items() if value is not None}
         self._rows.append({"step": str(step), "part": part, **{name: f"{v:.9g}" for name, v in finite.items()}})
         text = io.StringIO()
-        columns = dict.fromkeys(name for row in self._rows for name in row)
-        table = csv.DictWriter(text, list(columns), lineterminator="\n")
+        table = csv.DictWriter(
+            text, list(dict.fromkeys(name for row in self._rows for name in row)), lineterminator="\n"
+        )
         table.writeheader()
         table.writerows(self._rows)
         write_text(self._path, text.getvalue())
@@ -679,22 +661,6 @@ def _join_processes(settings: Settings) -> Iterator[None]:
         yield
     finally:
         distributed.destroy_process_group()
-
-
-def _read_in_turn(read: Callable[[], Built]) -> Built:
-    """Read in the first process, then in the others, which find its cache."""
-    found = read() if is_main() else None
-    if count_processes()[1] > 1:
-        distributed.barrier()
-    return read() if found is None else found
-
-
-def _send_to_all(row: Row) -> Row:
-    """Return the first process' row."""
-    rows = [row]
-    if count_processes()[1] > 1:
-        distributed.broadcast_object_list(rows)
-    return rows[0]
 
 
 @contextmanager
@@ -740,7 +706,7 @@ def warmup_cosine(step: int, steps: int) -> float:
     return 0.5 * (1 + math.cos(math.pi * (step - rise) / max(1, steps - rise)))
 
 
-def average_logarithms(values: Iterable[float | None]) -> float:
+def geometric_mean(values: Iterable[float | None]) -> float:
     """Geometric mean of the positive ones among them, NaN of none: a tenth less of any counts alike."""
     logs = [math.log(value) for value in values if value is not None and value > 0]
     return math.exp(sum(logs) / len(logs)) if logs else math.nan
@@ -775,7 +741,3 @@ def _average(rows: Sequence[Row]) -> Row:
 
 def _copy_weights(network: nn.Module) -> dict[str, Tensor]:
     return {name: value.clone() for name, value in network.state_dict().items()}
-
-
-def _read_card(name: str) -> checkpoints.Card:
-    return checkpoints.read_card(checkpoints.locate(name).with_suffix(".json"))

@@ -8,48 +8,20 @@ changed alike, so the task stays the same.
 
 import math
 import re
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from mapctl import kinematics, rotations
+from mapctl import rotations
 from mapctl.contacts import ContactSettings
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed, mirror_features
-from mapctl.inbetweening import PositionImage
-from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts, PartialMotion, interpolate_quats, mirror_quats
-from mapctl.numerics.intervals import fill_missing, fill_missing_angle
+from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts, PartialMotion, mirror_quats
 from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.training.data import Corpus, find_window_starts, number_clip_folders
-
-
-def interpolate_positions(
-    positions_world: Float[Tensor, "batch frames joints 3"],
-    local_quat_xyzw: Float[Tensor, "batch frames joints 4"],
-    known: Bool[Tensor, "batch frames joints"],
-) -> Float[Tensor, "batch frames joints 3"]:
-    """Interpolate world positions, metres, on canonical bones; known ones as they are. Unknown values may be anything
-    finite.
-
-    A rotation is known while the joint and its children are.
-    """
-    shown = known.clone()
-    for joint, parent in enumerate(CANONICAL.parents):
-        if parent >= 0:
-            shown[..., parent] &= known[..., joint]
-    matrices = rotations.to_matrix(interpolate_quats(local_quat_xyzw, shown))
-    root = fill_missing(positions_world[:, :, 0], known[..., 0])
-    interpolated = kinematics.positions_from_matrices(CANONICAL, matrices) + root[:, :, None]
-    return torch.where(known[..., None], positions_world, interpolated)
-
-
-def interpolate_heading(heading: Float[Tensor, "batch frames"], known: Bool[Tensor, "batch frames joints"]) -> Tensor:
-    """Interpolate headings, radians, linearly along the shorter arc between frames whose root is known."""
-    return fill_missing_angle(heading, known[..., 0])
-
 
 KINDS = ("walk-turn", "walk", "run|dash", "^cmu")
 """Kinds of clips, as patterns of their names, among which windows are evened; clips of none are another kind."""
@@ -62,12 +34,9 @@ _AROUND = 9  # frames, so that a shift of weight is no walk
 class FeatureBatch:
     """Windows of features."""
 
-    features: Float[Tensor, "batch window size"]
-    """As in the corpus, or mirrored."""
-    first: Int[Tensor, " batch"]
-    """Frame of the joined corpus that each begins with."""
-    mirrored: Bool[Tensor, " batch"]
-    """Whether left and right are exchanged."""
+    features: Float[Tensor, "batch window size"]  # as in the corpus, or mirrored
+    first: Int[Tensor, " batch"]  # frame of the joined corpus that each begins with
+    mirrored: Bool[Tensor, " batch"]  # whether left and right are exchanged
 
 
 class FeatureWindows:
@@ -88,30 +57,21 @@ class FeatureWindows:
             self.groups = [self.starts[folder[self.starts] == number] for number in folder.unique()]
             self.groups = [group for group in self.groups if len(group)]
             self.probabilities = torch.tensor([float(len(group)) for group in self.groups]) ** (1 - evenness)
-        self._pick = self._pick_any if evenness is None else self._pick_evened
+        self.evened = evenness is not None
 
-    def draw(self, batch: int, generator: torch.Generator, *, mirror: bool = True) -> FeatureBatch:
-        """So many, half of them mirrored if that is allowed."""
-        first = self._pick(batch, generator)
+    def draw(self, batch: int, generator: torch.Generator) -> FeatureBatch:
+        """So many, half of them mirrored."""
+        if self.evened:
+            drawn = torch.multinomial(self.probabilities, batch, replacement=True, generator=generator).tolist()
+            shares = torch.rand(batch, generator=generator).tolist()
+            groups = [self.groups[number] for number in drawn]
+            first = torch.stack([each[int(share * len(each))] for each, share in zip(groups, shares, strict=True)])
+        else:
+            first = self.starts[torch.randint(len(self.starts), (batch,), generator=generator)]
         windows = self.features[first[:, None] + torch.arange(self.frames)]
-        if not mirror:
-            return FeatureBatch(windows, first, torch.zeros(batch, dtype=torch.bool))
         mirrored = torch.rand(batch, generator=generator) < 0.5
         windows = torch.where(mirrored[:, None, None], mirror_features(windows), windows)
         return FeatureBatch(windows, first, mirrored)
-
-    def _pick_any(self, batch: int, generator: torch.Generator) -> Int[Tensor, " batch"]:
-        return self.starts[torch.randint(len(self.starts), (batch,), generator=generator)]
-
-    def _pick_evened(self, batch: int, generator: torch.Generator) -> Int[Tensor, " batch"]:
-        groups = torch.multinomial(self.probabilities, batch, replacement=True, generator=generator)
-        shares = torch.rand(batch, generator=generator)
-        return torch.stack(
-            [
-                self.groups[group][int(share * len(self.groups[group]))]
-                for group, share in zip(groups.tolist(), shares.tolist(), strict=True)
-            ]
-        )
 
 
 def _thin_standing(
@@ -127,83 +87,8 @@ def _thin_standing(
     return starts[~standing | left]
 
 
-@dataclass(frozen=True, eq=False)
-class Window:
-    """A batch of whole motions."""
-
-    positions: Float[Tensor, "batch frames joints 3"]
-    """World, metres, on canonical bones."""
-    quats: Float[Tensor, "batch frames joints 4"]
-    """Local rotations, xyzw."""
-    heading: Float[Tensor, "batch frames"]
-    """Heading of the hips, radians."""
-    contacts: Float[Tensor, "batch frames 2"]
-    """Left and right toe planted, 0 or 1."""
-    present: Bool[Tensor, "batch frames"]
-    """Whether there is such a frame; the clip may be shorter."""
-
-    def image(self, known: Bool[Tensor, "batch frames joints"]) -> PositionImage:
-        """With gaps, in which the guess is slerp's."""
-        known = known & self.present[..., None]
-        positions = interpolate_positions(self.positions, self.quats, known)
-        return PositionImage.of_world(
-            positions, interpolate_heading(self.heading, known), self.contacts, known=known, present=self.present
-        )
-
-
-class PositionWindows:
-    """Draws windows from a corpus, half of them mirrored."""
-
-    def __init__(self, corpus: Corpus, *, frames: int, evenness: float):
-        """`evenness` among the corpus' top folders: 0 draws by their frames, 1 the same number from each."""
-        self.frames = frames
-        self.lengths, self.clip_starts = corpus.locate_clips()
-        self.ground, self.heading = corpus.integrate_roots()
-        self.contacts = LAYOUT.pick(corpus.features, "contacts")
-        poses = [BodyPose.of_features_in_place(part) for part in corpus.features.split(_CHUNK_FRAMES)]
-        self.local = torch.cat([pose.joints_world() for pose in poses])
-        self.quats = torch.cat([pose.local_quat_xyzw for pose in poses])
-        folder = number_clip_folders(corpus)
-        share = torch.zeros(int(folder.max()) + 1).index_add(0, folder, self.lengths.float())
-        self.probabilities = self.lengths / share[folder] ** evenness
-        self.mirror_joints = CANONICAL.mirror_partners()
-
-    def moments(self) -> tuple[Float[Tensor, "joints 3"], Float[Tensor, "joints 3"]]:
-        """Mean and standard deviation of each position relative to its own root, of a motion and its mirror image."""
-        flip = self.local.new_tensor([-1.0, 1.0, 1.0])
-        mean, square = self.local.mean(dim=0), self.local.square().mean(dim=0)
-        mean, square = (mean + flip * mean[self.mirror_joints]) / 2, (square + square[self.mirror_joints]) / 2
-        return mean, (square - mean.square()).clamp_min(0).sqrt()
-
-    def draw(self, batch: int, generator: torch.Generator) -> Window:
-        """So many windows, clips by chance and moments evenly."""
-        clip = torch.multinomial(self.probabilities, batch, replacement=True, generator=generator)
-        spare = self.lengths[clip] - self.frames  # a shorter clip begins anywhere in the window
-        lead = (torch.rand(batch, generator=generator) * (spare.abs() + 1)).long() * torch.sign(spare)
-        return self.at(clip, lead, mirrored=torch.rand(batch, generator=generator) < 0.5)
-
-    def at(
-        self, clip: Int[Tensor, " batch"], first: Int[Tensor, " batch"], *, mirrored: Bool[Tensor, " batch"]
-    ) -> Window:
-        """From these frames of these clips on; frames before a clip's first and after its last are not present."""
-        frame = first[:, None] + torch.arange(self.frames)
-        present = (frame >= 0) & (frame < self.lengths[clip][:, None])
-        index = self.clip_starts[clip][:, None] + frame.clamp_min(0).minimum(self.lengths[clip][:, None] - 1)
-        local, heading, contacts = self.local[index], self.heading[index], self.contacts[index]
-        ground, side = self.ground[index], torch.where(mirrored, -1.0, 1.0)[:, None]
-        flip = torch.stack([side, torch.ones_like(side), torch.ones_like(side)], dim=-1)
-        local = torch.where(mirrored[:, None, None, None], local[:, :, self.mirror_joints], local) * flip[:, :, None]
-        contacts = torch.where(mirrored[:, None, None], contacts.flip(-1), contacts)
-        heading, ground = heading * side, ground * flip[..., ::2]
-        positions = rotations.rotate_about_y(local, heading[..., None]) + rotations.lift_ground(ground)[:, :, None]
-        quats = self.quats[index]
-        over = quats[:, :, self.mirror_joints] * quats.new_tensor([1.0, -1.0, -1.0, 1.0])
-        quats = torch.where(mirrored[:, None, None, None], over, quats)
-        quats[:, :, 0] = rotations.multiply(rotations.about_y(heading), quats[:, :, 0])
-        return Window(positions, quats, heading, contacts, present)
-
-
 _WIDE = {"UpperArm": 0.6, "LowerArm": 0.5, "UpperLeg": 0.5, "LowerLeg": 0.5}
+_LOWERING = 0.6  # metres by which tilted hips are lowered, at most
 _TURN_SIGMA = torch.tensor(
     [0.0] + [next((wide for part, wide in _WIDE.items() if part in name), 0.3) for name in CANONICAL.names[1:]]
 )
@@ -219,11 +104,7 @@ class PoseVariation:
     drift: float = 0.3
     """Turn that is added over the window, as a share of the first."""
     tilted: float = 0.35
-    """Share of windows whose hips are tilted about a horizontal axis, and lowered."""
-    tilt: float = 1.6
-    """Largest tilt, radians."""
-    lowering: float = 0.6
-    """Largest lowering, metres."""
+    """Share of windows whose hips are tilted about a horizontal axis, by up to 1.6 radians, and lowered."""
 
 
 def vary_poses(
@@ -233,8 +114,7 @@ def vary_poses(
     variation: PoseVariation,
     generator: torch.Generator,
 ) -> tuple[Float[Tensor, "batch frames"], Float[Tensor, "batch frames joints 4"], Float[Tensor, "batch frames"]]:
-    """Return headings (radians), local rotations (the hips' without their heading) and hips heights (metres) of windows
-    in other poses."""
+    """Return headings (radians), rotations (the hips' without heading) and hips heights (metres) in other poses."""
     batch, frames, joints = quats.shape[:3]
 
     def uniform(*shape: int) -> Tensor:
@@ -248,8 +128,8 @@ def vary_poses(
     vectors = amount[:, None, None, None] * (turn(1.0) + progress * turn(variation.drift))
     tilted, about = uniform() < variation.tilted, 2 * math.pi * uniform()
     axis = torch.stack([about.cos(), torch.zeros(batch), about.sin()], dim=-1)
-    tilt = rotations.from_rotation_vector((tilted * variation.tilt * uniform())[:, None] * axis)
-    lowered = height - (tilted * variation.lowering * uniform())[:, None]
+    tilt = rotations.from_rotation_vector((tilted * 1.6 * uniform())[:, None] * axis)
+    lowered = height - (tilted * _LOWERING * uniform())[:, None]
     quats = rotations.multiply(quats, rotations.from_rotation_vector(vectors))
     hips = rotations.multiply(tilt[:, None].expand(-1, frames, -1), quats[..., 0, :])
     turned, upright = rotations.split_heading(hips)
@@ -290,18 +170,9 @@ _VARIED = (
 """Joints whose bones vary together, and how many of their axes: widths along x alone, lengths along all."""
 
 
-@dataclass(frozen=True)
-class Variation:
-    """How bodies, tempos and poses vary. Legs keep their length, the unit of all others."""
-
-    tempo: float = 0.1
-    """Largest change of tempo, as a share."""
-    bones: float = 0.15
-    """Largest change of the widths of shoulders and hips and of the lengths of trunk, forearms and hands."""
-    share: float = 0.5
-    """Share of windows whose tempo, and share whose bones vary."""
-    poses: PoseVariation = field(default_factory=PoseVariation)
-    """How far poses leave those of the clips."""
+TEMPO, _BONES = 0.1, 0.15
+"""Largest changes, as shares, of tempo, and of the widths of shoulders and hips and of the lengths of trunk, forearms
+and hands: legs keep their length, the unit of all others. Half of the windows vary in the one, half in the other."""
 
 
 class WindowPicker:
@@ -317,8 +188,7 @@ class WindowPicker:
     def pick(
         self, span: Int[Tensor, " batch"], generator: torch.Generator
     ) -> tuple[Int[Tensor, " batch"], Int[Tensor, " batch"]]:
-        """Pick clips, and the first frames of windows of so many frames in them; RequestError where no clip is so
-        long."""
+        """Pick clips, and first frames of windows of so many frames; RequestError where no clip is so long."""
         room = (self.lengths - int(span.max()) + 1).clamp_min(0).float()
         if not bool(room.any()):
             raise RequestError(f"no clip is as long as the window of {int(span.max())} frames")
@@ -340,13 +210,14 @@ class PoseWindows:
         self.quats = torch.cat([rotations.from_rotation_vector(pose.rotation_vectors) for pose in poses])
 
     def draw(
-        self, batch: int, frames: int, generator: torch.Generator, *, variation: Variation | None = None
+        self, batch: int, frames: int, generator: torch.Generator, *, variation: PoseVariation | None = None
     ) -> PartialMotion:
-        """So many windows of so many frames, of which everything is known; RequestError where no clip is so long."""
+        """So many windows of so many frames, of which everything is known; a `variation` varies tempo, bones and poses.
+        RequestError where no clip is so long."""
         tempo = torch.ones(batch)
         if variation is not None:
-            chosen = torch.rand(batch, generator=generator) < variation.share
-            change = variation.tempo * (2 * torch.rand(batch, generator=generator) - 1)
+            chosen = torch.rand(batch, generator=generator) < 0.5
+            change = TEMPO * (2 * torch.rand(batch, generator=generator) - 1)
             tempo = torch.where(chosen, 1 + change, 1.0)
         clip, first = self.picker.pick(1 + ((frames - 1) * tempo).ceil().long(), generator)
         window = self.at(clip, first, frames, tempo)
@@ -354,7 +225,11 @@ class PoseWindows:
         window = choose_rows(mirrored, window.mirrored(), window)
         if variation is None:
             return window
-        return _leave_poses(_reshape_bodies(window, variation, generator), variation.poses, generator)
+        window = _reshape_bodies(window, generator)
+        root = window.root_position.clone()
+        heading, quats, root[..., 1] = vary_poses(window.heading, window.quats, root[..., 1], variation, generator)
+        varied = replace(window, root_position=root, heading=heading, quats=quats)
+        return replace(varied, contacts=keep_still(window.contacts, varied.world_poses()[0]))
 
     def at(
         self, clip: Int[Tensor, " batch"], first: Int[Tensor, " batch"], frames: int, tempo: Float[Tensor, " batch"]
@@ -364,8 +239,7 @@ class PoseWindows:
         return self.gather(clip[:, None].expand_as(time), time)
 
     def gather(self, clip: Int[Tensor, "batch frames"], time: Float[Tensor, "batch frames"]) -> PartialMotion:
-        """Gather frames of any clips; times are in frames and may lie between two, those beyond a clip's last frame
-        show that."""
+        """Gather frames of clips at times in frames, which may lie between two; beyond a clip's last, that one."""
         low = time.floor().long()
         weight = (time - low).float()
         last = self.lengths[clip] - 1
@@ -390,6 +264,29 @@ class PoseWindows:
         return rotations.average(torch.cat([sample, mirror_quats(sample)]).double()).float()
 
 
+class PaddedWindows:
+    """Draws windows from a corpus, half of them mirrored, in which shorter clips lie whole."""
+
+    def __init__(self, corpus: Corpus, *, frames: int, evenness: float):
+        """`evenness` among the corpus' top folders: 0 draws by their frames, 1 the same number from each."""
+        self.frames, self.poses = frames, PoseWindows(corpus, evenness=0.0)
+        folder, lengths = number_clip_folders(corpus), self.poses.lengths
+        share = torch.zeros(int(folder.max()) + 1).index_add(0, folder, lengths.float())
+        self.probabilities = lengths / share[folder] ** evenness
+
+    def draw(self, batch: int, generator: torch.Generator) -> tuple[PartialMotion, Bool[Tensor, "batch frames"]]:
+        """So many windows, clips by chance and moments evenly, and whether a clip has each of their frames."""
+        clip = torch.multinomial(self.probabilities, batch, replacement=True, generator=generator)
+        length = self.poses.lengths[clip]
+        spare = length - self.frames  # a shorter clip begins anywhere in the window
+        lead = (torch.rand(batch, generator=generator) * (spare.abs() + 1)).long() * torch.sign(spare)
+        mirrored = torch.rand(batch, generator=generator) < 0.5
+        frame = lead[:, None] + torch.arange(self.frames)
+        present = (frame >= 0) & (frame < length[:, None])
+        motion = self.poses.gather(clip[:, None].expand_as(frame), frame.clamp_min(0).double())
+        return choose_rows(mirrored, motion.mirrored(), motion), present
+
+
 def find_kind(name: str) -> int:
     """Number of the first of KINDS that is in a clip's name; that of none is one more than the last."""
     return next((number for number, kind in enumerate(KINDS) if re.search(kind, name)), len(KINDS))
@@ -406,25 +303,22 @@ def choose_rows(chosen: Tensor, one: PartialMotion, other: PartialMotion) -> Par
     return replace(other, **{name: pick(name) for name in names})
 
 
-def _reshape_bodies(window: PartialMotion, variation: Variation, generator: torch.Generator) -> PartialMotion:
+def _reshape_bodies(window: PartialMotion, generator: torch.Generator) -> PartialMotion:
     """Give bodies other widths and lengths, the same on both sides."""
     batch = len(window.offsets)
     factors = torch.ones(batch, CANONICAL.num_joints, 3)
     for joints, axes in _VARIED:
-        factor = 1 + variation.bones * (2 * torch.rand(batch, generator=generator) - 1)
+        factor = 1 + _BONES * (2 * torch.rand(batch, generator=generator) - 1)
         factors[:, CANONICAL.indices(joints), :axes] = factor[:, None, None]
-    chosen = (torch.rand(batch, generator=generator) < variation.share)[:, None, None]
+    chosen = (torch.rand(batch, generator=generator) < 0.5)[:, None, None]
     return replace(window, offsets=torch.where(chosen, window.offsets * factors, window.offsets))
-
-
-def _leave_poses(window: PartialMotion, variation: PoseVariation, generator: torch.Generator) -> PartialMotion:
-    """Turn joints, tilt and lower bodies."""
-    root = window.root_position.clone()
-    heading, quats, root[..., 1] = vary_poses(window.heading, window.quats, root[..., 1], variation, generator)
-    varied = replace(window, root_position=root, heading=heading, quats=quats)
-    return replace(varied, contacts=keep_still(window.contacts, varied.world_poses()[0]))
 
 
 def add_targets(motion: PartialMotion) -> PartialMotion:
     """Aim hands and feet at where they are."""
     return replace(motion, targets=motion.world_poses()[0][..., list(EFFECTORS), :])
+
+
+def measure_lengths(vectors: Float[Tensor, "*batch axes"], least: float = 1e-10) -> Float[Tensor, "*batch"]:
+    """Norms whose gradient is finite at zero: their squares are `least` at least."""
+    return (vectors.square().sum(dim=-1) + least).sqrt()

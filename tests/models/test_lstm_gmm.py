@@ -304,7 +304,7 @@ def labelled_density() -> LstmGmmDensity:
     names = ("a_run_old_1", "a_walk_old_2", "a_walk_new_3", "a_run_new_4")
     found = select_initial_states(model, replace(data, names=names), count=4, generator=generator())
     pattern = r"_(?P<gait>run)?(walk)?_(?P<style>old)?"
-    card = Card("lstm-gmm", model.config.as_card(), licence="none", data={"labels": pattern}, **Card.layout_fields())
+    card = Card("lstm-gmm", model.config.as_card(), licence="none", data={"labels": pattern})
     return LstmGmmDensity("named", model, found, DataLimits(0.5, 1.5, 1.0), card, use_fast=False)
 
 

@@ -6,10 +6,10 @@ import tiny_path
 import torch
 from helpers import walk
 
+import priors
 from mapctl import rotations
 from mapctl.inbetweening.root_trajectory import LocalMotion, RootTrajectory
 from mapctl.kinematics import heading
-from priors import path
 
 
 def local_motion(frames=90, **options):
@@ -52,7 +52,7 @@ def test_a_mirrored_walk_goes_the_mirrored_way():
 
 
 def test_the_bundled_one_knows_standing_and_how_far_a_walk_goes():
-    predictor, motion = path.load(), walk(90)
+    predictor, motion = priors.load_path(), walk(90)
     assert "Bandai" in predictor.card.licence or "NC" in predictor.card.licence
     stands = LocalMotion.of_world(motion.joint_positions().float()[None, :1].expand(1, 90, 21, 3), torch.zeros(1, 90))
     assert float(predictor.predict(stands).steps_heading.abs().max()) < 0.002

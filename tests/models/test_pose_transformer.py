@@ -1,5 +1,6 @@
 """The pose transformer: what it keeps, what it is given, and its two stages."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -12,6 +13,7 @@ from controllers.inbetweening.pipeline import CanonicalClip
 from mapctl import rotations
 from mapctl.inbetweening.partial_motion import KnownParts
 from mapctl.motion import Motion
+from mapctl.numerics.intervals import count_frames_to_observed
 from mapctl.recording.masks import ALL, Mask, MissingMask
 from mapctl.retarget import to_canonical
 from priors import pose_transformer as module
@@ -137,3 +139,10 @@ def test_the_second_stage_adds_to_what_the_first_proposes(hide_parts):
     corrected = result(hide(result, hidden))
     torch.testing.assert_close(corrected.rough.local_matrix, proposed.rough.local_matrix)
     assert float((corrected.local_matrix - proposed.local_matrix)[:, 10:20].abs().max()) > 0.01
+
+
+def test_frames_since_and_until_an_observed_one_are_infinite_where_there_is_none():
+    observed = torch.tensor([[False, True, False, False, True, False], [False] * 6])
+    found = count_frames_to_observed(observed)
+    assert found[0].T.tolist() == [[math.inf, 0, 1, 2, 0, 1], [1, 0, 2, 1, 0, math.inf]]
+    assert bool(found[1].isinf().all())

@@ -16,7 +16,7 @@ from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.intent.keyframes import Keys
 from mapctl.recording.masks import ALL, Mask, MissingMask
 from mapctl.retarget import to_canonical
-from priors.stitcher import Draws, Joined, fit_shared, see_ends
+from priors.stitcher import Joined, fit_shared, see_ends
 
 each_length = pytest.mark.parametrize("frames", [2, 3, 4, 5, 8, 15, 24])
 
@@ -58,28 +58,24 @@ def test_only_the_poses_of_bare_ends_are_seen():
     assert torch.equal(one.quats, two.quats)
 
 
-def test_the_first_draws_do_not_depend_on_the_count_and_differ():
+def test_draws_are_the_same_in_any_order_and_differ():
     ends = bare(walk(60), 11, 30)
-    few, many = (
-        tiny_stitcher().draw(ends, 20, count=count, generator=torch.Generator().manual_seed(3)) for count in (3, 11)
-    )
-    assert torch.equal(few.quats, many.quats[:3])
-    assert len(many.quats) == 11
-    assert float((many.quats[0] - many.quats[9]).abs().max()) > 1e-4
+    first, other = (tiny_stitcher().drawing(3) for _ in range(2))
+    found = {number: first.draw(ends, 11, 20, number) for number in (0, 9, 17)}
+    again = {number: other.draw(ends, 11, 20, number) for number in (17, 9, 0)}
+    assert all(torch.equal(found[number].quats, again[number].quats) for number in found)
+    assert float((found[0].quats - found[9].quats).abs().max()) > 1e-4
 
 
-def test_draws_that_are_not_finite_are_dropped_and_counted():
-    result = tiny_stitcher().draw(bare(walk(60), 11, 30), 20, count=8, generator=torch.Generator().manual_seed(3))
-    result.root_position[[2, 3]] = torch.nan
-    draws = Draws(0)
-
-    def pick(number):
-        return draws.pick(bare(walk(60), 11, 30), 11, 20, number, lambda noise, heat: result)
-
-    assert torch.equal(pick(2).quats, result.quats[4:5])
-    assert torch.equal(pick(1).quats, result.quats[1:2])
-    result.root_position[:] = torch.nan
-    assert Draws(0).pick(bare(walk(60), 11, 30), 11, 20, 0, lambda noise, heat: result) is None
+def test_draws_that_are_not_finite_are_dropped():
+    drawing, ends = tiny_stitcher().drawing(0), bare(walk(60), 11, 30)
+    fourth = drawing.draw(ends, 11, 20, 4)
+    (chunk,) = drawing.chunks.values()
+    chunk.root_position[[2, 3]] = torch.nan
+    assert torch.equal(drawing.draw(ends, 11, 20, 2).quats, fourth.quats)
+    assert torch.equal(drawing.draw(ends, 11, 20, 1).quats, chunk.quats[1:2])
+    chunk.root_position[:] = torch.nan
+    assert drawing.draw(ends, 11, 20, 0) is None
 
 
 def test_an_answer_that_is_not_finite_is_left_to_another():

@@ -18,11 +18,12 @@ from mapctl.errors import CheckpointError, RequestError
 from mapctl.inbetweening import PositionImage
 from mapctl.kinematics import heading
 from mapctl.motion_dna import MotionDna
+from mapctl.numerics.intervals import fill_missing_angle
 from mapctl.recording.masks import ALL, Mask, MissingMask
 from mapctl.retarget import to_canonical
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOE_REST_HEIGHT
-from priors.training.recipes.tweener import collect_dna, compute_classes
-from priors.training.windows import interpolate_heading, interpolate_positions
+from priors.training.recipes.infiller import interpolate_positions
+from priors.training.recipes.tweener import collect_dna
 from priors.tweener import (
     INPUT_ROWS,
     PAPER,
@@ -226,7 +227,7 @@ def test_vectors_are_means_over_clips_and_come_back_from_the_card():
     torch.testing.assert_close(classes["both"].vector, (each[0] + each[1]) / 2, atol=2e-3, rtol=2e-3)
     torch.testing.assert_close(classes["one"].vector, each[0], atol=2e-3, rtol=2e-3)
     assert count_clips(card.data)["classes"] == {"both": 2, "one": 1}
-    assert compute_classes(tiny.network(), result)["classes"]["walk"]["clips"] == 3
+    assert encode_classes(encoder, collect_dna(result))["classes"]["walk"]["clips"] == 3
 
 
 @pytest.mark.parametrize("vector", ["%%%", "AAAA", None, "AHwAfAB8AHwAfA=="])
@@ -246,17 +247,6 @@ def test_an_unknown_class_is_refused_with_the_nearest():
         pick_class({}, "walk")
 
 
-SMALL = GeneratorConfig((8, 8, 8, 12, 12, 12), (12, 12, 8, 8, 8, 8), style=5)
-
-
-def network(config=SMALL, seed=0):
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
-        result = GeneratorNetwork(config)
-        torch.nn.init.normal_(result.last.weight, std=0.05)
-    return result.eval().requires_grad_(False)
-
-
 def count(module):
     return sum(each.numel() for each in module.parameters())
 
@@ -269,7 +259,7 @@ def image_of(motion, keys, *, present=None, known_axes=None):
     between = interpolate_positions(positions, motion.local_quat_xyzw.float()[None], known)
     return PositionImage.of_world(
         between,
-        interpolate_heading(facing, known),
+        fill_missing_angle(facing, known[..., 0]),
         torch.zeros(1, motion.num_frames, 2),
         known=known,
         present=torch.ones(1, motion.num_frames, dtype=torch.bool) if present is None else present,
@@ -290,7 +280,7 @@ def test_weights_are_as_many_as_may_be_bundled_and_as_in_the_paper():
 
 
 def test_the_style_changes_the_answer_and_does_not_depend_on_the_order_of_its_poses():
-    result, image = network(), image_of(walk(70), (0, 69))
+    result, image = tiny.network(), image_of(walk(70), (0, 69))
     encoder = StyleEncoder(5)
     poses = torch.randn(1, 6, 21, 3, generator=generator())
     found = encoder(poses)
@@ -308,7 +298,7 @@ def test_batch_regularisation_is_nil_for_unit_responses_and_grows_with_mean_and_
     assert float(regularise_batch((unit, unit))) < 1e-6
     assert float(regularise_batch((unit + 0.5,))) == pytest.approx(0.25, rel=1e-3)
     assert float(regularise_batch((unit * 2.0, unit))) == pytest.approx(0.4805, rel=1e-3)
-    responses = network().generate(torch.randn(2, INPUT_ROWS, 128, generator=generator()), torch.zeros(2, 5))[1]
+    responses = tiny.network().generate(torch.randn(2, INPUT_ROWS, 128, generator=generator()), torch.zeros(2, 5))[1]
     assert len(responses) == 6 + 13
 
 

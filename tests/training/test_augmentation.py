@@ -19,7 +19,8 @@ from mapctl.recording.masks import MissingMask
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.training.augment import add_copies, copy_clip
 from priors.training.data import Corpus
-from priors.training.windows import PoseVariation, PoseWindows, PositionWindows, vary_features
+from priors.training.recipes.infiller import show_known
+from priors.training.windows import PaddedWindows, PoseVariation, PoseWindows, vary_features
 
 SWAP = CANONICAL.mirror_partners()
 
@@ -49,13 +50,12 @@ def seen_from_the_root(motion):
 
 def test_a_window_is_the_motion_from_that_frame_on():
     data = corpus(3, 60)
-    windows = PositionWindows(data, frames=24, evenness=0.0)
-    found = windows.at(torch.tensor([1, 2]), torch.tensor([10, 36]), mirrored=torch.tensor([False, False]))
-    assert found.present.all()
+    found = PoseWindows(data, evenness=0.0).at(torch.tensor([1, 2]), torch.tensor([10, 36]), 24, torch.ones(2))
+    positions = found.world_poses()[0]
     for row, (clip, first) in enumerate(((1, 10), (2, 36))):
         features = data.features[60 * clip : 60 * (clip + 1)]
         wanted = decoded(features).joint_positions()[first : first + 24]
-        assert (found.positions[row].double() - wanted).norm(dim=-1).max() < 1e-4
+        assert (positions[row].double() - wanted).norm(dim=-1).max() < 1e-4
         assert torch.equal(found.contacts[row], LAYOUT.pick(features, "contacts")[first : first + 24])
         facing = torch.from_numpy(about_y(found.heading[row]).apply([0.0, 0.0, 1.0]))
         hips = torch.from_numpy(Rotation.from_quat(decoded(features).local_quat_xyzw[:, 0].numpy()).as_matrix())
@@ -63,31 +63,32 @@ def test_a_window_is_the_motion_from_that_frame_on():
 
 
 def test_a_mirrored_window_is_the_window_in_a_mirror():
-    windows = PositionWindows(corpus(3, 60), frames=30, evenness=0.0)
-    clip, first = torch.tensor([0, 2]), torch.tensor([5, 20])
-    plain, mirrored = (windows.at(clip, first, mirrored=torch.tensor([side, side])) for side in (False, True))
-    flip = torch.tensor([-1.0, 1.0, 1.0])
-    assert torch.allclose(mirrored.positions, plain.positions[:, :, SWAP] * flip, atol=1e-5)
-    assert torch.allclose(mirrored.heading, -plain.heading)
-    assert torch.equal(mirrored.contacts, plain.contacts.flip(-1))
-    motion = walks(3, 60)[2].mirror()
+    plain = PoseWindows(corpus(3, 60), evenness=0.0).at(torch.tensor([2]), torch.tensor([20]), 30, torch.ones(1))
+    positions = plain.mirrored().world_poses()[0]
     # The walk itself in a mirror, but for where it starts and faces.
-    wanted = seen_from_the_root(motion)[20:50]
-    local = mirrored.positions[1] - mirrored.positions[1, :, :1] * torch.tensor([1.0, 0.0, 1.0])
-    assert (without_heading(local, mirrored.heading[1]) - wanted).norm(dim=-1).max() < 1e-4
+    wanted = seen_from_the_root(walks(3, 60)[2].mirror())[20:50]
+    local = positions[0] - positions[0, :, :1] * torch.tensor([1.0, 0.0, 1.0])
+    assert (without_heading(local, plain.mirrored().heading[0]) - wanted).norm(dim=-1).max() < 1e-4
+
+
+@pytest.mark.parametrize("frames", [40, 90])
+def test_a_shorter_clip_lies_whole_in_a_padded_window(frames):
+    motion, present = PaddedWindows(corpus(3, 60), frames=frames, evenness=0.0).draw(20, generator())
+    assert present.sum(dim=1).tolist() == [min(frames, 60)] * 20
+    assert bool(motion.world_poses()[0].isfinite().all())
 
 
 def test_the_guess_in_a_gap_is_the_one_that_filling_starts_from():
     """From the rotations of a batch, and of a motion on its rig, bent by the velocities beside the gap, too."""
-    windows = PositionWindows(corpus(3, 60), frames=40, evenness=0.0)
-    window = windows.at(torch.tensor([1]), torch.tensor([3]), mirrored=torch.tensor([False]))
+    shown = PoseWindows(corpus(3, 60), evenness=0.0).at(torch.tensor([1]), torch.tensor([3]), 40, torch.ones(1))
     known = torch.ones(1, 40, CANONICAL.num_joints, dtype=torch.bool)
     known[:, 10:25] = False
-    motion = Motion(CANONICAL, Fraction(30), window.positions[0, :, 0].double(), window.quats[0].double())
+    quats = rotations.from_matrix(shown.local_matrices()[0].double())
+    motion = Motion(CANONICAL, Fraction(30), shown.root_position[0].double(), quats)
     gone = ~known[0, :, 0]
     lost = MissingMask(gone[:, None].expand(-1, CANONICAL.num_joints), gone)
     wanted = interpolate_missing(motion, lost).joint_positions()
-    image = window.image(known)
+    image, _ = show_known(shown, torch.ones(1, 40, dtype=torch.bool), known)
     torch.testing.assert_close(image.to_world(image.positions)[0].double(), wanted, atol=0.05, rtol=0)
 
 

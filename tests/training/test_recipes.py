@@ -25,6 +25,7 @@ from mapctl.terms.trial import Trial
 from priors.path import PathNetwork
 from priors.training.critics import FREE_RUN_MOMENTS, HistoryBuffer, MomentWeights, moment_loss, show
 from priors.training.data import Corpus, find_window_starts
+from priors.training.recipes import tweener
 from priors.training.recipes.denoiser import compute_denoiser_losses, draw_performers
 from priors.training.recipes.infiller import compute_infiller_losses, sample_observation_mask
 from priors.training.recipes.keyframe_timing import solve_weights
@@ -40,7 +41,7 @@ from priors.training.recipes.tweener import (
     group_clips,
     measure_gap,
 )
-from priors.training.windows import FeatureWindows, PoseWindows, PositionWindows, add_targets
+from priors.training.windows import FeatureWindows, PaddedWindows, PoseWindows, add_targets
 from priors.tweener import LABELS, ConstrainedPose, GeneratedPoses, GeneratorNetwork
 
 pytestmark = pytest.mark.usefixtures("small_judgements")
@@ -182,10 +183,10 @@ def test_gaps_grow_until_half_of_training():
 
 @pytest.mark.parametrize("architecture", ["skips", "image"])
 def test_an_infiller_answers_for_what_it_changes(architecture):
-    window = PositionWindows(corpus(2, 60), frames=60, evenness=0.0).draw(4, generator())
-    everything = window.present[..., None].expand(-1, -1, CANONICAL.num_joints)
+    motion, present = PaddedWindows(corpus(2, 60), frames=60, evenness=0.0).draw(4, generator())
+    everything = present[..., None].expand(-1, -1, CANONICAL.num_joints)
     network = tiny_infiller.network(config=replace(tiny_infiller.CONFIG, architecture=architecture))
-    parts = compute_infiller_losses(network, window, everything)
+    parts = compute_infiller_losses(network, motion, present, everything)
     assert parts["error_cm"] == 0
     assert (parts["position"] == 0) == (architecture == "skips")
 
@@ -264,8 +265,15 @@ def tweener_losses(sequences, windows, turned=0.0):
     return compute_tweener_losses(network, tiny_path.network(), sequences, poses, styled)
 
 
-def test_a_tweener_pays_for_what_is_off_between_keys_of_one_clip(windows):
-    sequences = draw_windows(windows, 3, 100, progress=1.0, generator=generator(), partial=False)
+@pytest.fixture
+def whole_keys(monkeypatch):
+    """Keys are whole poses."""
+    for name in ("_HALVES", "_POSITION_KEYS", "_DRAWINGS"):
+        monkeypatch.setattr(tweener, name, 0.0)
+
+
+def test_a_tweener_pays_for_what_is_off_between_keys_of_one_clip(windows, whole_keys):
+    sequences = draw_windows(windows, 3, 100, progress=1.0, generator=generator())
     found = tweener_losses(sequences, windows)
     assert all(float(found[name]) < 0.02 for name in ("positions_cm", "pace_cm", "feet_cm", "keys_cm", "turns"))
     turned = tweener_losses(sequences, windows, turned=0.1)
@@ -294,13 +302,13 @@ def gaps_of(known):
     return [(one, other) for one, other in pairwise(frames) if other > one + 1]
 
 
-def test_gaps_between_keys_grow_and_splices_lie_in_long_ones(windows):
+def test_gaps_between_keys_grow_and_splices_lie_in_long_ones(windows, whole_keys):
     for progress, most in ((0.0, 30), (0.125, 120), (1.0, 130)):
-        drawn = draw_windows(windows, 40, 130, progress=progress, generator=generator(), partial=False)
+        drawn = draw_windows(windows, 40, 130, progress=progress, generator=generator())
         longest = max(stop - start for row in drawn.known for start, stop in gaps_of(row))
         assert longest <= most
         assert bool(drawn.truthful.all())
-    drawn, found = draw_splices(windows, 6, 700, progress=1.0, generator=generator(), partial=False), 0
+    drawn, found = draw_splices(windows, 6, 700, progress=1.0, generator=generator()), 0
     for known, clip, truthful in zip(drawn.known, drawn.clip, drawn.truthful, strict=True):
         spliced = [(start, stop) for start, stop in gaps_of(known) if clip[start] != clip[stop]]
         found += len(spliced)

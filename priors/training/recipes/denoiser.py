@@ -12,22 +12,13 @@ from torch.nn.functional import binary_cross_entropy_with_logits as cross_entrop
 from mapctl import rotations
 from mapctl.features import LAYOUT
 from mapctl.pose import BodyPose
-from mapctl.recording import Capture, CaptureProposal
+from mapctl.recording import CaptureProposal
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
-from priors.checkpoints import require_at_least
 from priors.denoiser import DenoiserConfig, DenoiserNetwork
 from priors.training.augment import corrupt, make_clean_capture
 from priors.training.data import Corpus, Split
-from priors.training.loop import (
-    Count,
-    GradientTrainer,
-    MaybeCount,
-    NetworkSettings,
-    Row,
-    average_logarithms,
-    make_generator,
-)
-from priors.training.windows import FeatureWindows, PoseVariation, vary_features
+from priors.training.loop import Count, GradientTrainer, MaybeCount, NetworkSettings, Row, make_generator
+from priors.training.windows import FeatureWindows, PoseVariation, measure_lengths, vary_features
 
 # Weights beside that of the position error, cm, which is 1.
 _ANGLES = 20.0  # of the error of joint angles, radians: what turns about its own bone moves no joint
@@ -49,6 +40,7 @@ class DenoiserSettings(NetworkSettings):
     used_by = "use it with --denoiser"
     ours = DenoiserConfig()
     shape_options = ("width",)
+    least_window = 16
 
     steps: Count = 16_000
     """Steps in all."""
@@ -57,12 +49,7 @@ class DenoiserSettings(NetworkSettings):
     width: MaybeCount = None
     """Channels of every layer."""
 
-    def __post_init__(self):
-        super().__post_init__()
-        require_at_least(self, 16, "window")
-
     def make_trainer(self, parts: Split) -> "DenoiserTrainer":
-        """Make the trainer as it is before the first step."""
         return DenoiserTrainer(self, parts.train)
 
 
@@ -77,7 +64,6 @@ class DenoiserTrainer(GradientTrainer[DenoiserNetwork]):
         self.begin()
 
     def losses(self) -> dict[str, Tensor]:
-        """Compute the losses of a newly drawn batch."""
         windows = draw_performers(self.windows, self.settings.batch, self.generator)
         return compute_denoiser_losses(self.network, windows, self.generator)
 
@@ -95,7 +81,7 @@ class DenoiserTrainer(GradientTrainer[DenoiserNetwork]):
 
     def score(self, row: Row) -> float:
         """Return the loss of unseen windows."""
-        return average_logarithms([row.get("loss")])
+        return row.get("loss") or math.nan
 
 
 def draw_performers(
@@ -132,17 +118,17 @@ def compute_denoiser_losses(network: DenoiserNetwork, windows: Tensor, generator
     """The loss, and in plain units the errors that add up to it."""
     clean = make_clean_capture(windows)
     cleaned = network(corrupt(clean, generator))
-    angles = _pack_angles(clean)
+    packed = torch.cat([clean.root, clean.heading[..., None], clean.tilt, clean.joints.flatten(2)], dim=-1)
     bits = LAYOUT.pick(windows, "contacts")
-    wanted, got = BodyPose.unpack(_pack(clean)).joints_world(), cleaned.pose.joints_world()
-    position_error = 100 * _smooth_norm(got - wanted).mean()
-    slip = 100 * _smooth_norm(torch.diff(got - wanted, dim=1))
+    wanted, got = BodyPose.unpack(packed).joints_world(), cleaned.pose.joints_world()
+    position_error = 100 * measure_lengths(got - wanted, 1e-8).mean()
+    slip = 100 * measure_lengths(torch.diff(got - wanted, dim=1), 1e-8)
     planted = bits[:, 1:] * bits[:, :-1]
     feet = (slip[..., _TOES] * planted).sum() / planted.sum().clamp_min(1)
-    turned = (cleaned.pose.angles - angles).abs().mean()
+    turned = (cleaned.pose.angles - packed[..., 4:]).abs().mean()
     contacts = cross_entropy(cleaned.contact_logits.float(), bits)
     loss = position_error + _PACE * slip.mean() + _FEET * feet + _ANGLES * turned + _CONTACTS * contacts
-    spread = _compute_spread_loss(cleaned, _pack(clean))
+    spread = _compute_spread_loss(cleaned, packed)
     return {
         "loss": loss + _SPREAD * spread,
         "error_cm": position_error,
@@ -160,17 +146,3 @@ def _compute_spread_loss(cleaned: CaptureProposal, wanted: Float[Tensor, "batch 
     joints = torch.cat([error[..., None, 3:6], error[..., 6:].unflatten(-1, (-1, 3))], dim=-2).mean(dim=-1)
     power = torch.cat([error[..., :3].mean(dim=-1, keepdim=True), joints], dim=-1)
     return (0.5 * power * torch.exp(-2 * cleaned.log_spread) + cleaned.log_spread).mean()
-
-
-def _pack_angles(clean: Capture) -> Float[Tensor, "batch frames angles"]:
-    return torch.cat([clean.tilt, clean.joints.flatten(2)], dim=-1)
-
-
-def _pack(clean: Capture) -> Float[Tensor, "batch frames width"]:
-    """The pose of clean motion as BodyPose packs it."""
-    return torch.cat([clean.root, clean.heading[..., None], _pack_angles(clean)], dim=-1)
-
-
-def _smooth_norm(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-    """With a gradient at zero."""
-    return torch.sqrt(vector.square().sum(dim=-1) + 1e-8)

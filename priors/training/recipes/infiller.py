@@ -14,13 +14,18 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 from tyro.conf import arg
 
+from mapctl import kinematics, rotations
+from mapctl.inbetweening import PositionImage
+from mapctl.inbetweening.partial_motion import PartialMotion, interpolate_quats
+from mapctl.inbetweening.position_image import mirror_positions
+from mapctl.numerics.intervals import fill_missing, fill_missing_angle
+from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
-from priors.checkpoints import require_at_least
 from priors.infiller import InfillerConfig, InfillerNetwork
 from priors.training.augment import Draws
 from priors.training.data import Corpus, Split
-from priors.training.loop import Count, GradientTrainer, NetworkSettings, Row, average_logarithms, make_generator
-from priors.training.windows import PositionWindows, Window
+from priors.training.loop import Count, GradientTrainer, NetworkSettings, Row, geometric_mean, make_generator
+from priors.training.windows import PaddedWindows
 
 VALIDATED_GAPS = (15, 30, 60)
 """Gaps that are validated, frames, where a window has room for them."""
@@ -29,6 +34,7 @@ _ERROR_OFFSET_CM = 0.5  # cm that the guess may be off by before a window's weig
 _MAX_ERROR_CM = 4.0  # cm beyond which it falls no more
 _MIN_STD = 0.05  # metres: of a position that hardly moves, as the hips' over their own reference
 _JOINTS = CANONICAL.num_joints
+_CHUNK_FRAMES = 50_000
 
 # Weights beside that of the position error, cm, which is 1.
 _PACE = 1.0  # of the joints' velocity error, cm a frame
@@ -56,6 +62,7 @@ class InfillerSettings(NetworkSettings):
     used_by = "use it with --method infiller --inbetweener"
     ours = InfillerConfig()
     shape_options = ("architecture",)
+    least_window = 32
 
     steps: Count = 8_000
     """Steps in all."""
@@ -64,12 +71,7 @@ class InfillerSettings(NetworkSettings):
     architecture: Annotated[Literal["skips", "image"] | None, arg(metavar="skips|image")] = None
     """skips is ours, image that of Kaufmann et al. 2020."""
 
-    def __post_init__(self):
-        super().__post_init__()
-        require_at_least(self, 32, "window")
-
     def make_trainer(self, parts: Split) -> "InfillerTrainer":
-        """Make the trainer as it is before the first step."""
         return InfillerTrainer(self, parts.train)
 
 
@@ -77,32 +79,32 @@ class InfillerTrainer(GradientTrainer[InfillerNetwork]):
     """Draws windows, cuts gaps into them, and brings the network nearer to filling them."""
 
     def __init__(self, settings: InfillerSettings, corpus: Corpus):
-        self.windows = PositionWindows(corpus, frames=settings.window, evenness=_EVENNESS)
+        self.windows = PaddedWindows(corpus, frames=settings.window, evenness=_EVENNESS)
         self.config = settings.find_config()
         super().__init__(settings, lambda: InfillerNetwork(self.config, bfloat16=settings.bfloat16))
-        mean, std = self.windows.moments()
-        self.network.mean.copy_(mean)
-        self.network.std.copy_(std.clamp_min(_MIN_STD))
+        parts = corpus.features.split(_CHUNK_FRAMES)
+        local = torch.cat([BodyPose.of_features_in_place(part).joints_world() for part in parts])
+        local = torch.cat([local, mirror_positions(local)])
+        self.network.mean.copy_(local.mean(dim=0))
+        self.network.std.copy_(local.std(dim=0).clamp_min(_MIN_STD))
         self.begin()
 
     def losses(self) -> dict[str, Tensor]:
-        """Compute the losses of a newly drawn batch."""
-        window = self.windows.draw(self.settings.batch, self.generator)
-        known = sample_observation_mask(window.present, progress=self.step / self.steps, generator=self.generator)
-        return compute_infiller_losses(self.network, window, known)
+        motion, present = self.windows.draw(self.settings.batch, self.generator)
+        known = sample_observation_mask(present, progress=self.step / self.steps, generator=self.generator)
+        return compute_infiller_losses(self.network, motion, present, known)
 
     @torch.no_grad()
     def validate(self, corpus: Corpus) -> dict[str, Any]:
         """Measure the root-aligned joint error over a gap amid unseen windows, cm, beside that of the guess."""
         frames, row = self.settings.window, {}
-        windows = PositionWindows(corpus, frames=frames, evenness=_EVENNESS)
+        windows = PaddedWindows(corpus, frames=frames, evenness=_EVENNESS)
         for gap in [gap for gap in VALIDATED_GAPS if gap + _MARGIN_FRAMES <= frames]:
-            window = windows.draw(192, make_generator(gap))
+            motion, present = windows.draw(192, make_generator(gap))
             middle = (frames - gap) // 2
-            known = window.present[..., None].expand(-1, -1, CANONICAL.num_joints).clone()
+            known = present[..., None].expand(-1, -1, _JOINTS).clone()
             known[:, middle : middle + gap] = False
-            lacking, image = window.present[..., None] & ~known, window.image(known)
-            wanted = image.from_world(window.positions)
+            lacking, (image, wanted) = present[..., None] & ~known, show_known(motion, present, known)
             for name, positions in (("error", self.network(image).positions), ("guess", image.positions)):
                 wrong = 100 * (positions - wanted)
                 wrong = (wrong - wrong[..., :1, :]).norm(dim=-1) * lacking
@@ -112,10 +114,48 @@ class InfillerTrainer(GradientTrainer[InfillerNetwork]):
     def score(self, row: Row) -> float:
         """Return the error of gaps in unseen windows over that of the guess, geometric mean over their lengths."""
         gaps = [gap for gap in VALIDATED_GAPS if row.get(f"guess_{gap}_cm") and row.get(f"error_{gap}_cm")]
-        return average_logarithms(row[f"error_{gap}_cm"] / row[f"guess_{gap}_cm"] for gap in gaps)
+        return geometric_mean(row[f"error_{gap}_cm"] / row[f"guess_{gap}_cm"] for gap in gaps)
 
 
-def compute_infiller_losses(network: InfillerNetwork, window: Window, known: Tensor) -> dict[str, Tensor]:
+def interpolate_positions(
+    positions_world: Float[Tensor, "batch frames joints 3"],
+    local_quat_xyzw: Float[Tensor, "batch frames joints 4"],
+    known: Bool[Tensor, "batch frames joints"],
+) -> Float[Tensor, "batch frames joints 3"]:
+    """Interpolate world positions, metres, on canonical bones; known ones as they are. Unknown values may be anything
+    finite.
+
+    A rotation is known while the joint and its children are.
+    """
+    shown = known.clone()
+    for joint, parent in enumerate(CANONICAL.parents):
+        if parent >= 0:
+            shown[..., parent] &= known[..., joint]
+    matrices = rotations.to_matrix(interpolate_quats(local_quat_xyzw, shown))
+    root = fill_missing(positions_world[:, :, 0], known[..., 0])
+    interpolated = kinematics.positions_from_matrices(CANONICAL, matrices) + root[:, :, None]
+    return torch.where(known[..., None], positions_world, interpolated)
+
+
+def show_known(
+    motion: PartialMotion, present: Bool[Tensor, "batch frames"], known: Bool[Tensor, "batch frames joints"]
+) -> tuple[PositionImage, Float[Tensor, "batch frames joints 3"]]:
+    """Return the image of a motion with gaps, in which the guess is slerp's, and the true positions as it has them."""
+    known, quats, positions = known & present[..., None], motion.quats.clone(), motion.world_poses()[0]
+    quats[:, :, 0] = rotations.multiply(rotations.about_y(motion.heading), quats[:, :, 0])
+    image = PositionImage.of_world(
+        interpolate_positions(positions, quats, known),
+        fill_missing_angle(motion.heading, known[..., 0]),
+        motion.contacts,
+        known=known,
+        present=present,
+    )
+    return image, image.from_world(positions)
+
+
+def compute_infiller_losses(
+    network: InfillerNetwork, motion: PartialMotion, present: Bool[Tensor, "batch frames"], known: Tensor
+) -> dict[str, Tensor]:
     """The loss, and in plain units the errors that add up to it.
 
     L1 over the whole motion (Kaufmann et al. 2020, section 3.3), window by window divided by the number of coordinates
@@ -123,21 +163,20 @@ def compute_infiller_losses(network: InfillerNetwork, window: Window, known: Ten
     judged on what is not, an autoencoder on everything. A window in which the guess would do counts for more, or a
     network learns to fidget where a body stands still.
     """
-    image = window.image(known)
-    wanted = image.from_world(window.positions)
+    image, wanted = show_known(motion, present, known)
     proposed = network(image)
-    lacking = window.present[..., None] & ~known
-    filled = lacking if network.keeps_observed else window.present[..., None].expand_as(known)
+    lacking = present[..., None] & ~known
+    filled = lacking if network.keeps_observed else present[..., None].expand_as(known)
     wrong = 100 * (proposed.positions - wanted)
     weight = _weigh_windows(image.positions, wanted, lacking) / (3 * filled.sum(dim=(1, 2)).clamp_min(1))
     miss = (weight * (wrong.abs().sum(-1) * filled).sum(dim=(1, 2))).mean()
-    pairs = window.present[:, 1:] & window.present[:, :-1]
+    pairs = present[:, 1:] & present[:, :-1]
     slip = torch.diff(wrong, dim=1) * pairs[..., None, None]
     pace = (weight * slip.abs().sum(dim=(1, 2, 3))).mean()
-    planted = window.contacts[:, 1:] * window.contacts[:, :-1]
+    planted = motion.contacts[:, 1:] * motion.contacts[:, :-1]
     feet = (slip[..., list(TOE_JOINTS), :].abs().sum(-1) * planted).sum() / planted.sum().clamp_min(1)
     unsure = filled[..., list(TOE_JOINTS)]
-    guessed = cross_entropy(proposed.contacts, window.contacts, reduction="none")
+    guessed = cross_entropy(proposed.contacts, motion.contacts, reduction="none")
     contacts = (guessed * unsure).sum() / unsure.sum().clamp_min(1)
     loss = miss + _PACE * pace + _FEET * feet + _CONTACTS * contacts
     error = ((wrong - wrong[..., :1, :]).norm(dim=-1).detach() * lacking).sum() / lacking.sum().clamp_min(1)
@@ -177,18 +216,13 @@ def sample_observation_mask(
     return known | (lost[:, None] & first)[..., None]
 
 
-def _sample_interval(draw: Draws, length: Float[Tensor, " batch"]) -> Bool[Tensor, "batch frames"]:
-    """One run of so many frames, that may reach beyond the window's ends."""
-    return draw.mark(draw.uniform() * (draw.frames + 8 - length).clamp_min(1) - 4, length)
-
-
 def _sample_gaps(draw: Draws, length: float) -> Bool[Tensor, "batch frames"]:
     """True where a frame is known."""
     known = torch.ones(draw.batch, draw.frames, dtype=torch.bool)
     count = (1 + draw.uniform() * _SEVERAL).floor()
     for number in range(_SEVERAL):
         size = (length + _SPREAD * draw.normal()).clamp(2, draw.frames - 10)
-        known &= ~(_sample_interval(draw, size / count.sqrt()) & (number < count)[:, None])
+        known &= ~(draw.stretch(size / count.sqrt()) & (number < count)[:, None])
     return known
 
 
@@ -203,14 +237,14 @@ def _sample_partial(draw: Draws) -> Bool[Tensor, "batch frames joints"]:
     """Some joints, or all but some, known for a stretch."""
     some = draw.joints(limbs=0.5)
     other = draw.uniform(1) < 0.25
-    stretch = _sample_interval(draw, 1 + draw.uniform() ** 2 * draw.frames)
+    stretch = draw.stretch(1 + draw.uniform() ** 2 * draw.frames)
     return stretch[..., None] & torch.where(other, ~some, some)[:, None]
 
 
 def _sample_missing_joints(draw: Draws) -> Bool[Tensor, "batch frames joints"]:
     """All known but 1 to 3 joints, or a limb, throughout or for a stretch; or any joint now and then."""
     lost = draw.joints(limbs=0.5)[:, None].expand(-1, draw.frames, -1)
-    during = _sample_interval(draw, 10 + draw.uniform() * draw.frames) | (draw.uniform(1) < 0.7)
+    during = draw.stretch(10 + draw.uniform() * draw.frames) | (draw.uniform(1) < 0.7)
     dropped = draw.uniform(draw.frames, _JOINTS) < 0.5 * draw.uniform(1, 1)
     lost = torch.where((draw.uniform() < _DROPOUT)[:, None, None], dropped, lost & during[..., None])
     return ~lost

@@ -11,7 +11,7 @@ from mapctl.inbetweening.pose_pairs import TRAVELLING_DISTANCE, PosePairs, sampl
 from mapctl.pose import decode
 from priors.keyframe_timing import KeyframeTimingConfig, KeyframeTimingNetwork
 from priors.training.data import Corpus, Split
-from priors.training.loop import Count, Export, Row, Settings, Trainer, average_logarithms
+from priors.training.loop import Count, Export, Row, Settings, Trainer, geometric_mean
 
 _PAIRS = 5  # pairs of poses drawn of every clip
 _PERCENTILES = (0.1, 0.9)  # between which four of five pairs lie
@@ -69,7 +69,7 @@ class KeyframeTimingTrainer(Trainer[KeyframeTimingNetwork]):
 
     def score(self, row: Row) -> float:
         """Return the factor by which half of unseen pairs are off at most."""
-        return average_logarithms([row.get("half_off_by")])
+        return geometric_mean([row.get("half_off_by")])
 
     def export(self, parts: Split) -> Export:
         """Export the weights in float32: they are less than a kilobyte."""

@@ -56,7 +56,6 @@ from priors.training.loop import (
 from priors.training.windows import FeatureWindows
 
 _GRADIENT_CLIP = 5.0
-_WEIGHT_DECAY = 1e-4
 _INPUT_NOISE = 0.05  # standard deviation of the noise on normalised inputs (section 4.1.3)
 _NOISE_RANGE = 4.0  # largest noise of a window, as a multiple of that
 _BIT_FLIPS = 0.02  # share of input contact bits that are flipped
@@ -175,36 +174,22 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
 
     @property
     def exported(self) -> LstmGmm:
-        """The moving average of the weights."""
         return self.average
 
     def networks(self) -> dict[str, nn.Module]:
-        """All that is learnt, by its name in checkpoints."""
         critic = {} if self.critic_trainer is None else {"average": self.average, "critic": self.critic_trainer.network}
         return {"model": self.network, **critic}
 
     def optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        """One for each of the two that contend."""
         return super().optimisers() | (
             {} if self.critic_trainer is None else {"critic-optimiser": self.critic_trainer.optimiser}
         )
 
-    def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        """Make AdamW."""
-        rate = self.settings.learning_rate
-        return {"optimiser": torch.optim.AdamW(self.network.parameters(), lr=rate, weight_decay=_WEIGHT_DECAY)}
-
-    def read_initial_weights(self) -> dict[str, Tensor]:
-        """Read the initial prior's weights and statistics."""
-        return dict(density.load(self.settings.init).reference.state_dict())
-
     def state(self) -> dict[str, Tensor]:
-        """Return everything that a continuation needs, but the step."""
-        history = None if self.critic_trainer is None else self.critic_trainer.history
-        return super().state() | ({} if history is None else {"history": history.windows})
+        history = self.critic_trainer and self.critic_trainer.history
+        return super().state() | ({"history": history.windows} if history else {})
 
     def load_state(self, tensors: Mapping[str, Tensor], step: int) -> None:
-        """Go on from what `state` returned; KeyError or RuntimeError where it is not whole."""
         super().load_state(tensors, step)
         if self.critic_trainer is not None and "history" in tensors:
             self.critic_trainer.history = HistoryBuffer(tensors["history"].to(self.windows.features.device))
@@ -225,7 +210,6 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         return parts
 
     def losses(self) -> dict[str, Tensor]:
-        """Compute the losses of a newly drawn batch, nats a frame."""
         self._latest = self.draw_windows()
         return {"loss": -self._log_prob(*self._latest).mean()}
 
@@ -238,7 +222,6 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
             self._add_free_run_gradients(self.critic_trainer if joined else None)
 
     def compute_learning_rate(self) -> float:
-        """Compute that of the current step."""
         settings = self.settings
         if self._criticised >= 0:
             left = (settings.critic_steps - self._criticised) / max(1.0, _CRITIC_FALL * settings.critic_steps)
@@ -275,10 +258,12 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
             "starts.weight": found.weight,
         }
         data = {"holds": measure_pace_changes(parts.whole), "labels": settings.labels, "starts": list(found.names)}
+        held = [decode(clip, GroundPose.origin()) for part in (parts.validation, parts.test) for clip in part.clips()]
+        mocap = {name: spread._asdict() for name, spread in compute_reference(held).items()}
         quality = {
             "test_nats_per_frame": compute_validation_nats(model, parts.test),
             "windows": compute_window_nats(model, (parts.validation, parts.test)),
-            "mocap": _measure_mocap(parts),
+            "mocap": {name: row for name, row in mocap.items() if not math.isnan(row["mean"])},
             "data": summarise_states(parts.train.features),
         }
         return Export({**model.state_dict(), **starts}, data, quality, asdict(measure_data_limits(parts.train)))
@@ -415,7 +400,9 @@ def select_initial_states(
     speeds = torch.stack(
         [ground_speed(features[i][end - _SECOND : end]).mean() for i, end in zip(shuffled, ends, strict=True)]
     )
-    strata = _number_strata(labels, len(features))
+    strata = torch.zeros(len(features), dtype=torch.long)
+    if labels is not None and labels.shape[1]:
+        strata = torch.unique(labels, dim=0, return_inverse=True)[1]
     frames = torch.tensor(corpus.lengths, dtype=torch.float32)
     frames_of, of_starts = torch.zeros(int(strata.max()) + 1).index_add_(0, strata, frames), strata[shuffled]
     clips_of = torch.bincount(of_starts, minlength=len(frames_of))
@@ -423,7 +410,9 @@ def select_initial_states(
     for stratum, share in enumerate(_share_out(frames_of.tolist(), clips_of, count)):
         members = torch.nonzero(of_starts == stratum)[:, 0]
         picked += members[_select_by_speed(speeds[members], share)].tolist() if share else []
-    states = [_state_after(model, features[shuffled[k]][: ends[k]]) for k in picked]
+    before = [features[shuffled[k]][: ends[k]] for k in picked]
+    with torch.no_grad():
+        states = [model.advance(model.start_after(clip[:1]), clip[1:].unsqueeze(0)) for clip in before]
     state = LstmState(
         torch.cat([s.last_frame for s in states]),
         torch.cat([s.hidden for s in states], 1),
@@ -450,13 +439,6 @@ def measure_data_limits(corpus: Corpus) -> DataLimits:
     speeds, turns = torch.cat(speeds), torch.cat(turns)
     turn_rate = float(turns.quantile(0.995)) if len(turns) else 0.0  # the data may hold no walk
     return DataLimits(float(speeds.quantile(0.01)), float(speeds.quantile(0.99)), turn_rate)
-
-
-def _number_strata(labels: Tensor | None, clips: int) -> Int[Tensor, " clips"]:
-    """Number of each clip's combination of labels."""
-    if labels is None or labels.shape[1] == 0:
-        return torch.zeros(clips, dtype=torch.long)
-    return torch.unique(labels, dim=0, return_inverse=True)[1]
 
 
 def _share_out(frames: Sequence[float], clips: Int[Tensor, " strata"], count: int) -> list[int]:
@@ -504,16 +486,7 @@ def _compute_weights(
     return frames / frames.sum()
 
 
-def _state_after(model: LstmGmm, clip: Float[Tensor, "frames size"]) -> LstmState:
-    """Return the state after the whole clip."""
-    with torch.no_grad():
-        state = model.start_after(clip[:1])
-        return model.advance(state, clip[1:].unsqueeze(0))
-
-
-def measure_free_runs(
-    model: LstmGmm, corpus: Corpus, *, runs: int = 8, frames: int = 1500, temperature: float = 1.0, seed: int = 0
-) -> dict[str, float]:
+def measure_free_runs(model: LstmGmm, corpus: Corpus, *, runs: int = 8, frames: int = 1500) -> dict[str, float]:
     """Speed, height and pose variation of free runs, each as a ratio to the corpus, and the slowest run's last speed.
 
     Runs begin after the first two seconds of clips; their first ten seconds are not counted.
@@ -522,20 +495,13 @@ def measure_free_runs(
     clips = [clips[i * len(clips) // runs % len(clips)] for i in range(runs)]
     state = model.start_after(torch.stack([clip[0] for clip in clips]).to(model.mean.device))
     state = model.advance(state, torch.stack([clip[1:60] for clip in clips]).to(model.mean.device))
-    features, _ = model.sample(state, frames, make_generator(seed), temperature=temperature)
+    features, _ = model.sample(state, frames, make_generator(0))
     settled = features[:, min(_SETTLING_FRAMES, frames // 2) :].cpu()
     own, wanted = summarise_states(settled.flatten(0, 1)), summarise_states(corpus.features)
     result = {f"free_run_{name}_ratio": own[name] / wanted[name] for name in own}
     result["free_run_slowest_m_s"] = float(ground_speed(settled[:, -150:]).mean(-1).min())
     result["free_run_finite"] = float(torch.isfinite(features).all())
     return result
-
-
-def _measure_mocap(parts: Split) -> dict[str, dict[str, float]]:
-    """Measure the held-out clips: mean, 2nd and 98th percentile of every measure (NaN left out)."""
-    held = [decode(clip, GroundPose.origin()) for part in (parts.validation, parts.test) for clip in part.clips()]
-    table = {name: spread._asdict() for name, spread in compute_reference(held).items()}
-    return {name: row for name, row in table.items() if not math.isnan(row["mean"])}
 
 
 def compute_validation_nats(model: LstmGmm, corpus: Corpus, frames: int = 100) -> float:

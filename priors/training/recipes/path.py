@@ -16,26 +16,17 @@ from mapctl.inbetweening.root_trajectory import (
     average_displacement_errors,
     compute_displacement_errors,
 )
-from priors.checkpoints import require_at_least
 from priors.path import PathConfig, PathNetwork
 from priors.training.data import Corpus, Split
-from priors.training.loop import (
-    Count,
-    GradientTrainer,
-    NetworkSettings,
-    Number,
-    Row,
-    average_logarithms,
-    make_generator,
-)
-from priors.training.windows import PoseVariation, PoseWindows, Variation
+from priors.training.loop import Count, GradientTrainer, NetworkSettings, Number, Row, geometric_mean, make_generator
+from priors.training.windows import TEMPO, PoseVariation, PoseWindows
 
 _VALIDATED = ("V1", "V8", "V32", "V64", "Y")
 _SHORTEST_WINDOW = 32  # frames
 _MIN_STD = 0.05  # metres: of a position that hardly moves, as the thighs' from the hips
 _HEIGHT = 1.0  # weight of the error of the hips' height, cm; that of the displacements, cm, is 1
 _CONTACTS = 0.5  # weight of the contacts' cross entropy, nats
-_VARIATION = Variation(poses=PoseVariation(share=0.0, tilted=0.0))
+_VARIATION = PoseVariation(share=0.0, tilted=0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +36,7 @@ class PathSettings(NetworkSettings):
     kind = "path"
     used_by = "use it with mapctl infill --way A:B --path"
     ours = PathConfig()
+    least_window = _SHORTEST_WINDOW
 
     steps: Count = 12_000
     """Steps in all."""
@@ -55,12 +47,7 @@ class PathSettings(NetworkSettings):
     learning_rate: Number = 2e-3
     """At its highest; less to fine-tune."""
 
-    def __post_init__(self):
-        super().__post_init__()
-        require_at_least(self, _SHORTEST_WINDOW, "window")
-
     def make_trainer(self, parts: Split) -> "PathTrainer":
-        """Make the trainer as it is before the first step."""
         return PathTrainer(self, parts.train)
 
 
@@ -70,14 +57,13 @@ class PathTrainer(GradientTrainer[PathNetwork]):
     def __init__(self, settings: PathSettings, corpus: Corpus):
         self.windows = PoseWindows(corpus, evenness=1.0)
         # A window at the fastest tempo must fit into the longest clip.
-        self.longest = min(settings.window, int(int(self.windows.lengths.max()) / (1 + _VARIATION.tempo)) - 1)
+        self.longest = min(settings.window, int(int(self.windows.lengths.max()) / (1 + TEMPO)) - 1)
         self.config = settings.find_config()
         super().__init__(settings, lambda: PathNetwork(self.config, bfloat16=settings.bfloat16))
         _set_moments(self.network, self.windows)
         self.begin()
 
     def losses(self) -> dict[str, Tensor]:
-        """Compute the losses of a newly drawn batch."""
         spare = max(0, self.longest - _SHORTEST_WINDOW)
         frames = min(self.longest, _SHORTEST_WINDOW + int(torch.randint(spare + 1, (), generator=self.generator)))
         batch = max(1, self.settings.batch // frames)
@@ -93,7 +79,7 @@ class PathTrainer(GradientTrainer[PathNetwork]):
 
     def score(self, row: Row) -> float:
         """Return the errors over unseen clips, cm, geometric mean over spans and the height."""
-        return average_logarithms(row.get(f"{name}_cm") for name in _VALIDATED)
+        return geometric_mean(row.get(f"{name}_cm") for name in _VALIDATED)
 
 
 def compute_path_losses(network: PathNetwork, motion: PartialMotion) -> dict[str, Tensor]:

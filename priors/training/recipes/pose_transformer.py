@@ -13,7 +13,6 @@ from mapctl import rotations
 from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts, PartialMotion
 from mapctl.numerics import gaussian
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
-from priors.checkpoints import require_at_least
 from priors.pose_transformer import QUANTILES, PoseTransformerConfig, PoseTransformerNetwork, ProposedPoses
 from priors.training.augment import Draws
 from priors.training.data import Corpus, Split
@@ -25,21 +24,21 @@ from priors.training.loop import (
     NetworkSettings,
     Number,
     Row,
-    average_logarithms,
+    geometric_mean,
     make_adam,
     make_generator,
 )
-from priors.training.windows import PoseVariation, PoseWindows, Variation, add_targets
+from priors.training.windows import PoseVariation, PoseWindows, add_targets, measure_lengths
 
 VALIDATED_GAPS = (5, 15, 30, 45, 60, 120)
 """Gaps that are validated, frames."""
 _SHORTEST_WINDOW = 8  # frames
 _VALIDATED_WINDOWS = 128
-_UNFAMILIAR, _UNFAMILIAR_GAPS = Variation(poses=PoseVariation(share=1.0)), (5, 15, 30)
+_UNFAMILIAR, _UNFAMILIAR_GAPS = PoseVariation(share=1.0), (5, 15, 30)
 _CALIBRATED_FRAMES = (10, 20, 40, 60, 90)
 _MIN_STD_ROTATION, _MIN_STD_POSITION = 0.1, 0.05
 _JOINTS = CANONICAL.num_joints
-_TRUNK = CANONICAL.indices(("spine", "chest", "neck", "head"))
+_TRUNK = torch.isin(torch.arange(_JOINTS), torch.tensor(CANONICAL.indices(("spine", "chest", "neck", "head"))))
 
 # Weights of the loss.
 _POSITIONS = 10.0  # of the mean distance of joints from their true positions, metres
@@ -71,6 +70,7 @@ class PoseTransformerSettings(NetworkSettings):
     used_by = "use it with --inbetweener"
     ours = PoseTransformerConfig()
     shape_options = ("width", "layers", "detail")
+    least_window = 2 * _SHORTEST_WINDOW
 
     steps: Count = 11_500
     """Steps in all."""
@@ -88,17 +88,12 @@ class PoseTransformerSettings(NetworkSettings):
     """Layers of a second stage, which corrects what the first proposes; the first then looks at frames alone in which
     something is known."""
 
-    def __post_init__(self):
-        super().__post_init__()
-        require_at_least(self, 2 * _SHORTEST_WINDOW, "window")
-
     def make_config(self) -> PoseTransformerConfig:
         """Return the shape of the network that these settings ask for; the width decides the number of heads."""
         config = super().make_config()
         return config if self.width is None else replace(config, heads=max(1, self.width // 32))
 
     def make_trainer(self, parts: Split) -> "PoseTransformerTrainer":
-        """Make the trainer as it is before the first step."""
         return PoseTransformerTrainer(self, parts.train)
 
 
@@ -128,11 +123,10 @@ class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
         return {"optimiser": make_adam(others, self.settings.learning_rate), "muon": muon}
 
     def losses(self) -> dict[str, Tensor]:
-        """Compute the losses of a newly drawn batch."""
         share = float(torch.rand((), generator=self.generator))
         frames = round(_SHORTEST_WINDOW * (self.longest / _SHORTEST_WINDOW) ** share)
         batch = max(1, self.settings.batch // frames)
-        truth = add_targets(self.windows.draw(batch, frames, self.generator, variation=Variation()))
+        truth = add_targets(self.windows.draw(batch, frames, self.generator, variation=PoseVariation()))
         return compute_losses(self.network, truth, sample_known_parts(truth, self.generator))
 
     @torch.no_grad()
@@ -159,43 +153,29 @@ class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
 
     def score(self, row: Row) -> float:
         """Return the error of unseen windows over the interpolation's, geometric mean over gaps and lost arms."""
-        return average_logarithms(value for name, value in row.items() if name.startswith("share_"))
+        return geometric_mean(value for name, value in row.items() if name.startswith("share_"))
 
+    @torch.no_grad()
     def export(self, parts: Split) -> Export:
         """Calibrate the spread of the proposals on the validation clips, and measure that on the test clips."""
-        calibrate_spread(self, parts.validation)
+        over = zip(QUANTILES, _measure_spread(self.network, parts.validation, seed=1), strict=True)
+        # The nominal share of errors lies within the spreads then.
+        self.network.spread_shift += torch.tensor([float(each.quantile(share)) for share, each in over])
         done = super().export(parts)
-        done.quality |= measure_coverage(self, parts.test)
+        over = zip(QUANTILES, _measure_spread(self.network, parts.test, seed=2), strict=True)
+        done.quality |= {f"within_{share:.0%}": float((each <= 0).float().mean()) for share, each in over}
         return done
 
 
-@torch.no_grad()
-def calibrate_spread(trainer: PoseTransformerTrainer, corpus: Corpus) -> None:
-    """Shift the spreads' logarithms so that over unseen windows, in varied poses, the nominal share of errors lies
-    within them."""
-    over = _measure_spread(trainer, corpus, seed=1)
-    shift = [float(each.quantile(share)) for share, each in zip(QUANTILES, over, strict=True)]
-    trainer.network.spread_shift += torch.tensor(shift)
-
-
-@torch.no_grad()
-def measure_coverage(trainer: PoseTransformerTrainer, corpus: Corpus) -> dict[str, float]:
-    """Measure by spread the share of errors in unseen windows that lie within it."""
-    over = _measure_spread(trainer, corpus, seed=2)
-    return {
-        f"within_{share:.0%}": float((each <= 0).float().mean()) for share, each in zip(QUANTILES, over, strict=True)
-    }
-
-
-def _measure_spread(trainer: PoseTransformerTrainer, corpus: Corpus, seed: int) -> list[Tensor]:
+def _measure_spread(network: PoseTransformerNetwork, corpus: Corpus, seed: int) -> list[Tensor]:
     """Measure by quantile the logarithm of errors over the spread."""
     generator, windows = make_generator(seed), PoseWindows(corpus, evenness=1.0)
     found: list[Tensor] = []
     for frames in _CALIBRATED_FRAMES:
         if frames <= int(windows.lengths.max()):
-            truth = add_targets(windows.draw(_VALIDATED_WINDOWS, frames, generator, variation=Variation()))
-            shown = hide(trainer.network, sample_known_parts(truth, generator))
-            proposed = trainer.network(shown)
+            truth = add_targets(windows.draw(_VALIDATED_WINDOWS, frames, generator, variation=PoseVariation()))
+            shown = hide(network, sample_known_parts(truth, generator))
+            proposed = network(shown)
             distance = (proposed.poses(truth.offsets)[0] - truth.world_poses()[0]).norm(dim=-1)
             unknown = ~shown.known.positions
             found.append((torch.log(distance + 1e-4)[..., None] - proposed.log_spread)[unknown][::7])
@@ -248,18 +228,18 @@ def _compare(
     count = unknown.sum(dim=(1, 2)).clamp_min(1)
     weight = _weigh_windows((guess - wanted).norm(dim=-1), unknown)
     wrong = generated - wanted
-    distance = _length(wrong)
+    distance = measure_lengths(wrong)
     positions = (distance * unknown).sum(dim=(1, 2)) / count
     slip = torch.diff(wrong, dim=1)
     slipping = unknown[:, 1:] | unknown[:, :-1]
-    pace = (_length(slip) * slipping).sum(dim=(1, 2)) / count
-    twist = _length((generated_world - wanted_world).flatten(-2))
+    pace = (measure_lengths(slip) * slipping).sum(dim=(1, 2)) / count
+    twist = measure_lengths((generated_world - wanted_world).flatten(-2))
     turns = (twist * turned).sum(dim=(1, 2)) / turned.sum(dim=(1, 2)).clamp_min(1)
     lost = unknown[..., 0]
     hips = (distance[..., 0] * lost).sum(dim=1) / lost.sum(dim=1).clamp_min(1)
     toes = list(TOE_JOINTS)
     planted = truth.contacts[:, 1:] * truth.contacts[:, :-1] * slipping[..., toes]
-    feet = (_length(slip[..., toes, :]) * planted).sum(dim=(1, 2)) / planted.sum(dim=(1, 2)).clamp_min(1)
+    feet = (measure_lengths(slip[..., toes, :]) * planted).sum(dim=(1, 2)) / planted.sum(dim=(1, 2)).clamp_min(1)
     unsure = unknown[..., toes]
     nats = cross_entropy(proposed.contacts, truth.contacts, reduction="none")
     contacts = (nats * unsure).sum() / unsure.sum().clamp_min(1)
@@ -279,11 +259,6 @@ def _compare(
         "contacts_nats": contacts,
         "spread": spread,
     }
-
-
-def _length(vectors: Tensor) -> Tensor:
-    """Norm whose gradient is finite at zero."""
-    return (vectors.square().sum(dim=-1) + 1e-10).sqrt()
 
 
 def _weigh_windows(error: Tensor, unknown: Tensor) -> Float[Tensor, " batch"]:
@@ -324,12 +299,16 @@ def sample_known_parts(motion: PartialMotion, generator: torch.Generator) -> Par
     draw = Draws(generator, batch, frames)
     kind = draw.uniform()
     lossy, keyed = kind < _LOST, kind > 1 - _KEYS
-    poses = torch.where(keyed[:, None], _sample_keys(draw), _sample_gaps(draw))
+    keys = draw.uniform(frames) < 1 / (2 + draw.uniform(1) * 60)  # here and there, the first frame among them
+    keys[:, 0] = True
+    poses = torch.where(keyed[:, None], keys, _sample_gaps(draw))
     poses = torch.where((lossy & (draw.uniform() < 0.8))[:, None], True, poses)
     known = KnownParts.whole(poses)
     lost = torch.where(lossy[:, None, None], _sample_lost_joints(draw), False)
     reaching = lossy & (draw.uniform() < _REACHING)
-    lost = lost | _lose_trunk(draw, lost, reaching & (draw.uniform() < 0.5))
+    # Spine to head in the frames that lack any joint: a body that reaches far leans and turns.
+    bowed = reaching & (draw.uniform() < 0.5)
+    lost = lost | (bowed[:, None, None] & lost.any(dim=-1, keepdim=True) & _TRUNK)
     given = ~lossy & (draw.uniform() < _GIVEN)
     motion, known = _give_parts(draw, motion, known, given)
     known = replace(known, rotations=known.rotations & ~lost)
@@ -368,34 +347,13 @@ def _sample_gaps(draw: Draws) -> Bool[Tensor, "batch frames"]:
     return known
 
 
-def _sample_keys(draw: Draws) -> Bool[Tensor, "batch frames"]:
-    """Single frames here and there, the first one among them."""
-    known = draw.uniform(draw.frames) < 1 / (2 + draw.uniform(1) * 60)
-    known[:, 0] = True
-    return known
-
-
-def _sample_stretch(draw: Draws, shortest: float) -> Bool[Tensor, "batch frames"]:
-    length = shortest + draw.uniform() * (draw.frames - shortest)
-    return draw.mark(draw.uniform() * (draw.frames + 8 - length).clamp_min(1) - 4, length)
-
-
 def _sample_lost_joints(draw: Draws) -> Bool[Tensor, "batch frames joints"]:
     """1 to 3 joints, or one or two limbs, throughout or for a stretch; or any joint now and then."""
     joints = draw.joints(limbs=0.65)
     joints = joints | (draw.limb() & (draw.uniform(1) < 0.3))
-    during = _sample_stretch(draw, 6) | (draw.uniform(1) < 0.7)
+    during = draw.stretch(6 + draw.uniform() * (draw.frames - 6)) | (draw.uniform(1) < 0.7)
     dropped = draw.uniform(draw.frames, _JOINTS) < 0.5 * draw.uniform(1, 1)
     return torch.where((draw.uniform() < 0.15)[:, None, None], dropped, joints[:, None] & during[..., None])
-
-
-def _lose_trunk(
-    draw: Draws, lost: Bool[Tensor, "batch frames joints"], chosen: Bool[Tensor, " batch"]
-) -> Bool[Tensor, "batch frames joints"]:
-    """Spine to head of chosen windows in the frames that lack any joint: a body that reaches far leans and turns."""
-    trunk = torch.zeros(_JOINTS, dtype=torch.bool)
-    trunk[list(_TRUNK)] = True
-    return chosen[:, None, None] & lost.any(dim=-1, keepdim=True) & trunk
 
 
 def _sample_reached(draw: Draws, held: float) -> Bool[Tensor, "batch frames 1"]:
@@ -416,7 +374,7 @@ def _give_parts(
 
     joints = draw.joints(limbs=0.65)
     joints = torch.where(draw.uniform(1) < 0.4, ~joints, joints)
-    stretch = _sample_stretch(draw, 1)
+    stretch = draw.stretch(1 + draw.uniform() * (draw.frames - 1))
     rotations = known.rotations | (chosen(0.0, 0.2)[..., None] & joints[:, None] & stretch[..., None])
     # With joints often, else alone: where the hips go and face, as far as it is given.
     throughout = (chosen(0.0, 0.2) & (draw.uniform(1) < 0.6)) | chosen(0.2, 0.35)

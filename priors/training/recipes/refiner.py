@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated
 
@@ -24,7 +24,6 @@ from mapctl.metrics.realism import (
 from mapctl.pose import decode
 from priors import checkpoints
 from priors.checkpoints import require_at_least
-from priors.lstm_gmm import density
 from priors.lstm_gmm.density import LstmGmmDensity
 from priors.refiner import PAPER, LstmRefiner, RefinerConfig, RefinerNetwork, compute_end_effectors
 from priors.training.critics import WINDOW_MOMENTS, EndEffectorCritic, HistoryBuffer, moment_loss
@@ -110,7 +109,7 @@ class RefinerSettings(Settings):
     @cached_property
     def prior(self) -> LstmGmmDensity:
         """The density, loaded."""
-        return density.load(self.density)
+        return LstmGmmDensity.load(self.density)
 
     @property
     def chosen(self) -> str:
@@ -125,7 +124,7 @@ class RefinerSettings(Settings):
     def make_trainer(self, parts: Split) -> "AdversarialTrainer":
         """Make the trainer with samples of the density, to train on and to be measured."""
         raw, measured = self.sample(parts)
-        return AdversarialTrainer(self, parts.train, raw, RefinerEvaluator.of(measured, parts.validation))
+        return AdversarialTrainer(self, parts.train, raw, make_evaluator(measured, parts.validation))
 
     def sample(self, parts: Split) -> tuple[Corpus, Corpus]:
         """Sample motions to train on, and others to measure."""
@@ -140,17 +139,22 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
     """Refiner, critic and history, one round at a time. What is kept is the running mean of the refiner's weights."""
 
     def __init__(
-        self,
-        settings: RefinerSettings,
-        corpus: Corpus,
-        raw: Corpus,
-        evaluate: Callable[[RefinerNetwork], Row] = lambda network: {},
+        self, settings: RefinerSettings, corpus: Corpus, raw: Corpus, evaluate: Callable[[RefinerNetwork], Row]
     ):
         """`corpus` is captured, `raw` sampled from the density that is to be refined; `evaluate` measures a refiner."""
         super().__init__(settings)
         self.config, self.updates, self.evaluate = settings.config, _REFINER_UPDATES, evaluate
         statistics = compute_statistics(corpus, self.config, settings.window)
-        self.refiner, self.critic = draw_weights(lambda: self._make_sides(statistics), settings.seed)
+        reach = {name: statistics[name] for name in ("reach_mean", "reach_std")}
+        self.refiner, self.critic = draw_weights(
+            lambda: (
+                RefinerNetwork(self.config, **statistics),
+                EndEffectorCritic(
+                    self.config.joints, width=_CRITIC_WIDTH, around=_CRITIC_AROUND, slow=_CRITIC_SLOW, **reach
+                ),
+            ),
+            settings.seed,
+        )
         self.network = deepcopy(self.refiner).requires_grad_(False)
         self.captured = FeatureWindows(corpus, settings.window)
         self.raw = FeatureWindows(raw, settings.window + self.refiner.before + self.config.lookahead)
@@ -161,25 +165,10 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
             first = [self.refiner(self._draw(self.raw))[0] for _ in range(-(-count // settings.batch))]
         self.history = HistoryBuffer(torch.cat(first)[:count])
 
-    def _make_sides(self, statistics: dict[str, Tensor]) -> tuple[RefinerNetwork, EndEffectorCritic]:
-        """Make refiner and critic, their weights drawn in this order."""
-        refiner = RefinerNetwork(self.config, **statistics)
-        critic = EndEffectorCritic(
-            self.config.joints,
-            width=_CRITIC_WIDTH,
-            around=_CRITIC_AROUND,
-            slow=_CRITIC_SLOW,
-            reach_mean=statistics["reach_mean"],
-            reach_std=statistics["reach_std"],
-        )
-        return refiner, critic
-
     def networks(self) -> dict[str, nn.Module]:
-        """All that is learnt, by its name in checkpoints."""
         return {"averaged": self.network, "refiner": self.refiner, "critic": self.critic}
 
     def optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        """One for each side."""
         return {"refiner-optimiser": self.refiner_optimiser, "critic-optimiser": self.critic_optimiser}
 
     def warm_up(self) -> None:
@@ -210,16 +199,14 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
         return {"refiner": refiner, "critic": critic, "accuracy": accuracy, "updates": updates}
 
     def validate(self, corpus: Corpus) -> Row:
-        """Measure refined samples beside mocap's (see `RefinerEvaluator`, which holds validation clips)."""
+        """Measure refined samples beside mocap's (see `make_evaluator`, which has the validation clips)."""
         return self.evaluate(self.network)
 
     def state(self) -> dict[str, Tensor]:
-        """Return everything that a continuation needs, but the step."""
         updates = torch.tensor(self.updates)
         return {**super().state(), "history": self.history.windows, "updates": updates}
 
     def load_state(self, tensors: Mapping[str, Tensor], step: int) -> None:
-        """Go on from what `state` returned; KeyError or RuntimeError where it is not whole."""
         super().load_state(tensors, step)
         self.history = HistoryBuffer(tensors["history"])
         self.updates = int(tensors["updates"])
@@ -263,8 +250,7 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
         return compute_realism_gap(row)
 
     def find_stop_reason(self, rows: Sequence[Row]) -> str | None:
-        """Return why to stop after these losses since the last report: a loss is not finite, or the critic classifies
-        nearly all correctly."""
+        """Stop where a loss is not finite, or the critic has classified nearly all correctly since the last report."""
         if not all(math.isfinite(rows[-1][name]) for name in ("refiner", "critic")):
             return f"training diverged at step {self.step}"
         if len(rows) >= self.settings.report_steps and sum(row["accuracy"] for row in rows) / len(rows) > _CRITIC_WON:
@@ -273,7 +259,7 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
 
     def export(self, parts: Split) -> Export:
         """Return the best refiner so far, measured on the test clips, by which none was chosen."""
-        settings, evaluate = self.settings, RefinerEvaluator.of(self.settings.sample(parts)[1], parts.test)
+        settings, evaluate = self.settings, make_evaluator(self.settings.sample(parts)[1], parts.test)
         # Feet that never touch the floor have no speed there, and a card holds no other numbers than finite ones.
         test = {name: value if math.isfinite(value) else None for name, value in evaluate(self.network).items()}
         data = {
@@ -285,8 +271,7 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
 
 
 def compute_root_error(before: Tensor, after: Tensor) -> Tensor:
-    """Mean squared distance of root trajectories and heights (Wang et al. 2019, Eq. 13), m^2; `before` may go on
-    longer."""
+    """Mean squared distance of root trajectories and heights (Wang et al. 2019, Eq. 13), m^2; `before` may go on."""
     before = before[:, : after.shape[1]]
     origin = GroundPose(before.new_zeros(len(before), 2), before.new_zeros(len(before)))
     ground = integrate_root(before, origin)[0] - integrate_root(after, origin)[0]
@@ -310,46 +295,28 @@ def compute_statistics(corpus: Corpus, config: RefinerConfig, window: int) -> di
     return {"mean": mean, "std": std, "reach_mean": reach.mean(0), "reach_std": reach.std(0).clamp(min=0.01)}
 
 
-@dataclass(frozen=True, eq=False)
-class RefinerEvaluator:
-    """Measures refined samples beside the raw ones and mocap that training does not see."""
+def make_evaluator(raw: Corpus, held: Corpus) -> Callable[[RefinerNetwork], dict[str, float]]:
+    """Make the measurement of a refiner by samples that it refines anew each time, beside clips that training does not
+    see: contact speed and jitter as ratios to mocap's, and the accuracy of a classifier of both."""
+    clips, settings = [clip for clip in held.clips() if len(clip) > WINDOW_FRAMES], RealismSettings()
+    mocap, windows, samples = _average_measures(clips), _cut_clips(clips), torch.stack(raw.clips())
 
-    raw: Float[Tensor, "count frames size"]
-    """Samples that are refined anew each time."""
-    mocap: dict[str, float]
-    """Mocap's measures."""
-    windows: list[Tensor]
-    """Mocap's windows for the classifier."""
-    settings: RealismSettings = field(default_factory=RealismSettings)
-    """Settings of the realism classifier."""
-
-    @staticmethod
-    def of(raw: Corpus, held: Corpus, settings: RealismSettings | None = None) -> "RefinerEvaluator":
-        """Against clips that training does not see: of those that a refiner is chosen by, or of those that are left to
-        measure the chosen one."""
-        settings = settings or RealismSettings()
-        clips = [clip for clip in held.clips() if len(clip) > WINDOW_FRAMES]
-        motions = [decode(clip, GroundPose.origin()) for clip in clips]
-        windows = [cut_windows(canonical_positions(motion)) for motion in motions]
-        return RefinerEvaluator(torch.stack(raw.clips()), _average_measures(clips), windows, settings)
-
-    def __call__(self, network: RefinerNetwork) -> dict[str, float]:
-        """Contact speed and jitter as ratios to mocap's, and the classifier's accuracy."""
-        refiner = LstmRefiner("in training", network.eval(), _NO_CARD)
-        refined = refiner.refine(self.raw)
-        means = _average_measures(list(refined))
-        row = {
-            f"{name}_ratio": means[name] / self.mocap[name]
-            for name in ("contact_speed_cm_s", "jitter_m_s3")
-            if self.mocap[name] > 0
-        }
-        if min(len(refined), len(self.windows)) >= self.settings.min_clips:
-            generated = [cut_windows(canonical_positions(decode(clip, GroundPose.origin()))) for clip in refined]
+    def evaluate(network: RefinerNetwork) -> dict[str, float]:
+        refined = list(LstmRefiner("in training", network.eval(), _NO_CARD).refine(samples))
+        means, measured = _average_measures(refined), ("contact_speed_cm_s", "jitter_m_s3")
+        row = {f"{name}_ratio": means[name] / mocap[name] for name in measured if mocap[name] > 0}
+        if min(len(refined), len(windows)) >= settings.min_clips:
             seeded = torch.Generator().manual_seed(0)
             row["classifier_accuracy"] = compute_held_out_accuracy(
-                generated, self.windows, generator=seeded, settings=self.settings
+                _cut_clips(refined), windows, generator=seeded, settings=settings
             )
         return row
+
+    return evaluate
+
+
+def _cut_clips(clips: list[Tensor]) -> list[Tensor]:
+    return [cut_windows(canonical_positions(decode(clip, GroundPose.origin()))) for clip in clips]
 
 
 def sample_corpus(prior: LstmGmmDensity, corpus: Corpus, count: int, frames: int, generator: torch.Generator) -> Corpus:
@@ -378,7 +345,7 @@ def compute_realism_gap(row: Mapping[str, float | None]) -> float:
     return sum(abs(math.log(value)) for value in ratios) + 2 * max(0.0, accuracy - 0.5)
 
 
-_NO_CARD = checkpoints.Card("refiner", {}, licence="", **checkpoints.Card.layout_fields())
+_NO_CARD = checkpoints.Card("refiner", {}, licence="")
 
 
 def _average_measures(clips: list[Tensor]) -> dict[str, float]:

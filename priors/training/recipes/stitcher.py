@@ -20,7 +20,6 @@ from mapctl.kinematics import forward_kinematics
 from mapctl.kinematics.fast import place_joints
 from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
-from priors.checkpoints import require_at_least
 from priors.stitcher import (
     PACE,
     POSE,
@@ -44,11 +43,11 @@ from priors.training.loop import (
     GradientTrainer,
     NetworkSettings,
     Row,
-    average_logarithms,
+    geometric_mean,
     make_generator,
     update_average,
 )
-from priors.training.windows import WindowPicker
+from priors.training.windows import WindowPicker, measure_lengths
 
 _SHORTEST, _FIRST_LONGEST = 2, 8  # frames from pose to pose
 _LEAST_WINDOW = 16  # frames of the longest transition
@@ -94,18 +93,14 @@ class StitcherSettings(NetworkSettings):
     kind = "stitcher"
     used_by = "use it with --stitcher"
     ours = StitcherConfig()
+    least_window = _LEAST_WINDOW
 
     steps: Count = 12_000
     """Steps in all."""
     window: Count = 61
     """Frames from one pose to the other in the longest transition."""
 
-    def __post_init__(self):
-        super().__post_init__()
-        require_at_least(self, _LEAST_WINDOW, "window")
-
     def make_trainer(self, parts: Split) -> "StitcherTrainer":
-        """Make the trainer as it is before the first step."""
         return StitcherTrainer(self, parts.train)
 
 
@@ -132,24 +127,19 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
         return network
 
     def make_optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        """AdamW with a short memory."""
         return {"optimiser": torch.optim.AdamW(self.weights(), lr=self.settings.learning_rate, betas=(0.5, 0.9))}
 
     def weights(self) -> list[nn.Parameter]:
-        """Those of the posterior too."""
         return [*super().weights(), *self.posterior.parameters()]
 
     def networks(self) -> dict[str, nn.Module]:
-        """All that is learnt, by its name in checkpoints."""
         return super().networks() | {"posterior": self.posterior, "average": self.average}
 
     @property
     def exported(self) -> StitcherNetwork:
-        """The moving average of the weights."""
         return self.average
 
     def losses(self) -> dict[str, Tensor]:
-        """Compute the losses of a newly drawn batch."""
         longest = _FIRST_LONGEST + max(0, self.longest - _FIRST_LONGEST) * min(1.0, self.progress / _LENGTH_GROWTH)
         longest = max(_SHORTEST, min(round(longest), self.longest))
         frames = int(torch.randint(_SHORTEST, longest + 1, (), generator=self.generator))
@@ -166,13 +156,12 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
 
     @torch.no_grad()
     def validate(self, corpus: Corpus) -> dict[str, Any]:
-        """Measure transitions of unseen clips."""
         return measure_transitions(self.average, TransitionWindows(corpus, evenness=1.0))
 
     def score(self, row: Row) -> float:
         """Return the error of the calm answer to unseen transitions over the interpolation's, geometric mean over
         lengths, after a pose and after ten frames."""
-        return average_logarithms(value for name, value in row.items() if name.startswith(("bare_", "past_")))
+        return geometric_mean(value for name, value in row.items() if name.startswith(("bare_", "past_")))
 
     def export(self, parts: Split) -> Export:
         """Return the average of the weights, with draws as wide as they come near to the truth."""
@@ -184,26 +173,19 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
 class Known(NamedTuple):
     """Known ends of a transition."""
 
-    before: int = 0
-    """Frames before the first pose."""
-    after: int = 0
-    """Frames after the second."""
+    before: int = 0  # frames before the first pose
+    after: int = 0  # frames after the second
 
 
 @dataclass(frozen=True, eq=False)
 class Transition:
     """Transitions of one length, with a frame or more on either side."""
 
-    features: Float[Tensor, "batch window size"]
-    """Forwards, from the first frame known before to the last one known after."""
-    phases: Float[Tensor, "batch window 4"]
-    """Phases of both toes."""
-    frames: int
-    """From one pose to the other."""
-    lead: int
-    """Frames of the window before the first pose."""
-    known: Known
-    """Whether a frame is known."""
+    features: Float[Tensor, "batch window size"]  # from the first frame known before to the last after
+    phases: Float[Tensor, "batch window 4"]  # phases of both toes
+    frames: int  # from one pose to the other
+    lead: int  # frames of the window before the first pose
+    known: Known  # whether a frame is known
 
     @property
     def between(self) -> slice:
@@ -216,19 +198,11 @@ class Transition:
 
     def ends(self) -> Ends:
         """Return the input of a stitcher."""
-        known, back = self.known, reversed_features(self.features)
-        context = 1 + max(known.before, known.after)
+        back, (before, after) = reversed_features(self.features), self.known
         last = self.features.shape[1] - 1 - self.lead - self.frames  # the second pose, counted backwards
-        sides, present = [], []
-        for features, at, count in ((self.features, self.lead, known.before), (back, last, known.after)):
-            rows = features[:, at - count : at + 1]
-            sides.append(torch.cat([rows[:, :1].expand(-1, context - 1 - count, -1), rows], dim=1))
-            present.append((torch.arange(context) >= context - 1 - count).float())
         position, turn = self.integrate()
-        batch = len(self.features)
-        return Ends(
-            torch.stack(sides), torch.stack(present)[:, None].expand(-1, batch, -1), position[:, -1], turn[:, -1]
-        )
+        there, other = self.features[:, self.lead - before : self.lead + 1], back[:, last - after : last + 1]
+        return Ends.of(there, other, position[:, -1], turn[:, -1])
 
     def integrate(self) -> tuple[Float[Tensor, "batch frames 2"], Float[Tensor, "batch frames"]]:
         """Return ground positions and headings of the frames between and of the second pose, seen from the first."""
@@ -289,35 +263,26 @@ def _draw_known(generator: torch.Generator) -> Known:
 
 
 @dataclass(eq=False)
-class TaughtLatents:
-    """The posterior's latents, which has seen the truth, in the first rows of a batch, and what noise becomes in the
-    rest."""
+class TaughtLatents(DrawnLatents):
+    """The latents of a posterior that has seen the truth in a batch's first rows, and those of noise in the rest."""
 
-    posterior: PosteriorNetwork
-    """Sees the truth."""
-    truth: Float[Tensor, "2 batch frames size"]
-    """Normalised features from each end's next frame to the other end."""
-    missed: Float[Tensor, "2 informed generated size"]
-    """Error of the mean answer, in the first rows, whose latents are the posterior's."""
-    noise: DrawnLatents
-    """Noise of all rows; zeros at the mean."""
-    nats: list[Tensor] = field(default_factory=list)
-    """Divergences from the prior by row and dimension, the transition's first and then those of frames."""
-    cost: Tensor = field(default_factory=lambda: torch.zeros(()))
-    """The transition's divergence from a standard normal distribution, by row and dimension."""
+    posterior: PosteriorNetwork  # sees the truth
+    truth: Float[Tensor, "2 batch frames size"]  # normalised features from each end's next frame to the other end
+    missed: Float[Tensor, "2 informed generated size"]  # error of the mean answer, in the informed rows
+    nats: list[Tensor] = field(default_factory=list)  # from the prior: the transition's, then those of frames
+    cost: Tensor = field(default_factory=lambda: torch.zeros(()))  # from a standard normal
 
-    def share(self, prior: Gaussian, seen: Float[Tensor, "2 batch seen"]) -> Float[Tensor, "batch shared"]:
+    def share(self, prior: Gaussian) -> Float[Tensor, "batch shared"]:
         """Latent that both sides share over the transition."""
         count = self.missed.shape[1]
         if not count:
-            self.nats.append(self.noise.shared[:0])
-            return self.noise.share(prior, seen)
+            self.nats.append(self.shared[:0])
+            return super().share(prior)
         found = self.posterior.infer_shared(self.missed)
         self.cost = found.diverge(Gaussian(torch.zeros_like(found.mean), torch.zeros_like(found.mean)))
         # Held to a prior that sees the ends, the posterior would learn to encode nothing but these.
         self.nats.append(found.detach().diverge(prior.row(slice(count))))
-        noise = self.noise.shared
-        return torch.cat([found.draw(noise[:count]), prior.row(slice(count, None)).draw(noise[count:])])
+        return torch.cat([found.draw(self.shared[:count]), super().share(prior)[count:]])
 
     def own(self, prior: Gaussian, encoded: Float[Tensor, "2 batch width"], step: int) -> Float[Tensor, "2 batch own"]:
         """A frame's, of both sides."""
@@ -325,9 +290,8 @@ class TaughtLatents:
         ahead = [min(step + number, last) for number in range(SEEN_FUTURE)]
         found = self.posterior.infer_own(self.truth[:, :, ahead], encoded)
         self.nats.append(found.diverge(prior).mean(dim=0))
-        noise = self.noise.slow[:, :, step]
-        informed = torch.arange(noise.shape[1]) < self.missed.shape[1]
-        return torch.where(informed[:, None], found.draw(noise), prior.draw(noise))
+        informed = torch.arange(self.slow.shape[1]) < self.missed.shape[1]
+        return torch.where(informed[:, None], found.draw(self.slow[:, :, step]), super().own(prior, encoded, step))
 
     def diverge(self) -> dict[str, Tensor]:
         """Return the divergences that are learnt, nats a transition, by the names of their weights."""
@@ -342,28 +306,26 @@ class TaughtLatents:
 @torch.no_grad()
 def miss_calmly(network: StitcherNetwork, truth: Transition) -> Float[Tensor, "2 batch generated size"]:
     """Return what the calm answer to the ends of transitions misses of the truth, in units of the features' spread."""
-    count, generated = len(truth.features), count_generated(network, truth.frames)
+    count, generated = len(truth.features), count_generated(truth.frames)
     if not count:
         return network.mean.new_zeros(2, 0, generated, len(network.mean))
-    calm = DrawnLatents.calm(network.config, count, generated)
+    calm = DrawnLatents.calm(network.config, count, truth.frames)
     found = walk_sides(network, truth.ends(), truth.frames, calm).features
     return (truth.truth()[:, :, :generated] - found) / network.std
 
 
 @torch.no_grad()
 def sample_nearest(network: StitcherNetwork, truth: Transition, generator: torch.Generator) -> DrawnLatents:
-    """Sample several latents for each of some transitions, and return those whose answers have joints nearest to the
-    truth."""
-    count, generated = len(truth.features), count_generated(network, truth.frames)
-    tries = TRIES if count else 0
-    every = torch.arange(count).repeat(tries)
-    noise = DrawnLatents.sample(network.config, len(every), generated, generator)
-    if not tries:
+    """Sample several latents for each transition, and return those whose joints come nearest to the truth."""
+    count = len(truth.features)
+    every = torch.arange(count).repeat(TRIES)
+    noise = DrawnLatents.sample(network.config, len(every), truth.frames, generator)
+    if not count:
         return noise
     repeated = truth.rows(every)
     sides = walk_sides(network, repeated.ends(), truth.frames, noise)
-    away = (sides.place_joints() - repeated.place_joints(generated)).norm(dim=-1)
-    best = away.mean(dim=(0, 2, 3)).unflatten(0, (tries, count)).argmin(dim=0)
+    away = (sides.place_joints() - repeated.place_joints(count_generated(truth.frames))).norm(dim=-1)
+    best = away.mean(dim=(0, 2, 3)).unflatten(0, (TRIES, count)).argmin(dim=0)
     return noise.rows(best * count + torch.arange(count))
 
 
@@ -374,12 +336,12 @@ def find_stitcher_losses(
     batch = len(truth.features)
     informed, calm, compared = (round(batch * share) for share in itertools.accumulate(SHARES.values()))
     row = torch.arange(batch)
-    noise = DrawnLatents.sample(network.config, batch, count_generated(network, truth.frames), generator)
+    noise = DrawnLatents.sample(network.config, batch, truth.frames, generator)
     noise = noise.still((row >= informed) & (row < calm))
     nearest = row[calm:compared]
     noise = noise.put(nearest, sample_nearest(network, truth.rows(nearest), generator))
     wanted, missed = truth.truth(), miss_calmly(network, truth.rows(row[:informed]))
-    latents = TaughtLatents(posterior, (wanted - network.mean) / network.std, missed, noise)
+    latents = TaughtLatents(noise.shared, noise.slow, posterior, (wanted - network.mean) / network.std, missed)
     sides = walk_sides(network, truth.ends(), truth.frames, latents)
     parts, distance, slip = _compare(network, truth, sides, compared)
     parts |= latents.diverge()
@@ -401,25 +363,27 @@ def find_stitcher_losses(
 
 def _compare(
     network: StitcherNetwork, truth: Transition, sides: Sides, compared: int
-) -> tuple[
-    dict[str, Tensor],
-    Float[Tensor, "sides compared generated joints"],
-    Float[Tensor, "sides compared generated joints"],
-]:
+) -> tuple[dict[str, Tensor], Tensor, Tensor]:
     """Compare the first rows with the truth, and let all of them meet and stand; also return the distances of joints
     from their true positions, and the errors of their steps, metres."""
     generated = sides.features.shape[2]
     true, positions = truth.truth()[:, :compared, :generated], sides.place_joints()
-    # Windows that interpolation nearly solves count for more, or the network learns to fidget where bodies stand still.
-    ease = weigh_windows(truth)[:compared]
+    # Windows that interpolation nearly solves count for more, or the network learns to fidget where bodies stand still:
+    # by a power of its mean error, 1 at 5 cm.
+    with torch.no_grad():
+        body, guess = interpolate(truth)
+        error = (body.joints_world() - guess.joints_world()).norm(dim=-1).mean(dim=(1, 2))[:compared]
+        ease = ((_EASE_METRES + 0.01) / (error + 0.01)) ** _EASE
     wrong = positions[:, :compared] - truth.place_joints(generated)[:, :compared]
-    distance = _measure_length(wrong)
-    slip = _measure_length(torch.diff(wrong, dim=2, prepend=torch.zeros_like(wrong[:, :, :1])))
+    distance = measure_lengths(wrong)
+    slip = measure_lengths(torch.diff(wrong, dim=2, prepend=torch.zeros_like(wrong[:, :, :1])))
     off = ((sides.features[:, :compared] - true) / network.std).abs()
-    steps = _measure_length(torch.diff(positions[..., list(TOE_JOINTS), :], dim=2))
+    steps = measure_lengths(torch.diff(positions[..., list(TOE_JOINTS), :], dim=2))
     # A draw is compared with no truth: toes that its own sides call planted are to stand.
     stand = torch.cat([true[..., POSE.stop :], sides.features[:, compared:, :, POSE.stop :].detach()], dim=1)
     planted = stand[:, :, 1:] * stand[:, :, :-1]
+    both = truth.frames - generated - 1  # first frame of the overlap, as each side counts
+    apart = measure_lengths(positions[0, :, both:] - positions[1, :, both:].flip(1)).mean(dim=-1)
     phases = torch.cat([sides.at_ends[:, :, None], sides.phases[:, :, : generated - 1]], dim=2)[:, :compared]
     parts = {
         "positions": (ease * distance.mean(dim=(0, 2, 3))).mean(),
@@ -427,27 +391,10 @@ def _compare(
         "state": (ease * (off[..., PACE].mean(dim=-1) + off[..., POSE].mean(dim=-1)).mean(dim=(0, 2))).mean(),
         "contacts": cross_entropy(sides.logits[:, :compared], true[..., POSE.stop :]),
         "feet": (steps * planted).sum() / planted.sum().clamp_min(1),
-        "stitching": measure_apart(positions, truth.frames).mean(),
+        "stitching": apart.mean(),
         "phase": (phases - truth.true_phases()[:, :compared, :generated]).abs().mean(),
     }
     return parts, distance, slip
-
-
-def measure_apart(
-    positions: Float[Tensor, "2 batch generated joints 3"], frames: int
-) -> Float[Tensor, "batch overlap"]:
-    """Measure the mean distance of the sides' joints in the frames that both generated, metres."""
-    generated = positions.shape[2]
-    first = frames - generated
-    return _measure_length(positions[0, :, first - 1 :] - positions[1, :, first - 1 :].flip(1)).mean(dim=-1)
-
-
-@torch.no_grad()
-def weigh_windows(truth: Transition) -> Float[Tensor, " batch"]:
-    """Weigh transitions by a power (_EASE) of the mean error of the interpolation: 1 at 5 cm."""
-    body, guess = interpolate(truth)
-    error = (body.joints_world() - guess.joints_world()).norm(dim=-1).mean(dim=(1, 2))
-    return ((_EASE_METRES + 0.01) / (error + 0.01)) ** _EASE
 
 
 def interpolate(truth: Transition) -> tuple[BodyPose, BodyPose]:
@@ -461,15 +408,9 @@ def interpolate(truth: Transition) -> tuple[BodyPose, BodyPose]:
     return tuple(BodyPose.of_features_at(*each) for each in ((features, ground, heading), (even, *there)))  # type: ignore[return-value]
 
 
-def _measure_length(vectors: Tensor) -> Tensor:
-    """Norm whose gradient is finite at zero."""
-    return (vectors.square().sum(dim=-1) + 1e-10).sqrt()
-
-
 @torch.no_grad()
 def measure_transitions(network: StitcherNetwork, windows: TransitionWindows) -> dict[str, float]:
-    """Measure the calm answer to two bare poses, and to a pose after 10 frames, as shares of the interpolation's mean
-    distance of joints."""
+    """Measure calm answers to bare poses, and after 10 frames: mean distance of joints over the interpolation's."""
     row: dict[str, float] = {}
     for name, known in (("bare", Known()), ("past", Known(before=10))):
         for gap in VALIDATED_GAPS:
@@ -493,8 +434,8 @@ def calibrate_temperature(network: StitcherNetwork, windows: TransitionWindows) 
         truth = windows.draw(_WINDOWS, gap + 1, Known(), make_generator(gap))
         true = interpolate(truth)[0].joints_world()[:, :-1]
         unit = (place_answers(network, truth) - true).norm(dim=-1).mean()
-        generator, batch, generated = make_generator(0), len(truth.features), count_generated(network, truth.frames)
-        draws = [DrawnLatents.sample(network.config, batch, generated, generator) for _ in range(_DRAWS)]
+        generator, batch = make_generator(0), len(truth.features)
+        draws = [DrawnLatents.sample(network.config, batch, truth.frames, generator) for _ in range(_DRAWS)]
         for number, temperature in enumerate(TEMPERATURES):
             placed = torch.stack([place_answers(network, truth, each.scale(temperature)) for each in draws])
             scores[number] += (placed - true).norm(dim=-1).mean(dim=(2, 3)).amin(dim=0).mean() / unit
@@ -506,7 +447,7 @@ def place_answers(
 ) -> Float[Tensor, "batch frames joints 3"]:
     """Return the joints' positions, metres, seen from the first pose, that a stitcher puts between the ends of
     transitions; with latents at their mean unless others are given."""
-    calm = DrawnLatents.calm(network.config, len(truth.features), count_generated(network, truth.frames))
+    calm = DrawnLatents.calm(network.config, len(truth.features), truth.frames)
     joined = join_sides(walk_sides(network, truth.ends(), truth.frames, latents or calm))
     offsets = CANONICAL.offsets.to(joined.quats)
     return forward_kinematics(offsets, CANONICAL.parents, joined.root_position, joined.quats)[0]

@@ -30,9 +30,7 @@ from mapctl.numerics.intervals import last_observed, next_observed, true_interva
 from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors import checkpoints
-from priors import path as path_predictor
-from priors.checkpoints import require_at_least
-from priors.path import PathNetwork
+from priors.path import ConvPathPredictor, PathNetwork
 from priors.training.data import Corpus, Split
 from priors.training.loop import (
     Count,
@@ -41,10 +39,10 @@ from priors.training.loop import (
     Name,
     NetworkSettings,
     Row,
-    average_logarithms,
+    geometric_mean,
     make_generator,
 )
-from priors.training.windows import KINDS, PoseWindows, choose_rows, find_kind
+from priors.training.windows import KINDS, PoseWindows, choose_rows, find_kind, measure_lengths
 from priors.tweener import (
     LABELS,
     PAPER,
@@ -83,6 +81,7 @@ _SOME = 3  # of so many sequences one has its trajectory predicted and its rotat
 _ACTIVITY_FRAMES = 32  # over which joints' speeds and accelerations are averaged
 _DNA_GAP = 90  # frames, 3 s, for each of which a gap has a pose of the style (Eq. 12)
 _MIN_STD = 0.05  # metres
+_LEAST = 1e-8  # of squared errors, for a finite gradient
 
 # Sequences.
 _SPLICED = 0.25  # share of the frames that are in sequences spliced of several clips
@@ -102,11 +101,7 @@ _SPLICED_FROM = 90  # frames of the shortest gap with a splice, 3 s
 _RUNS, _RUN = 0.4, 12  # share of keys that are several frames, a pose and its pace, and their most frames
 _OPEN_ENDS = 0.1  # share of sequences that begin, and as many that end, without a key
 _SPEED = 1.5  # m/s, below which the hips travel where clips are spliced
-_HALVES, _POSITION_KEYS, _DRAWINGS = (
-    0.1,
-    0.1,
-    0.1,
-)  # shares with keys of parts of a body, of ground positions, and drawings
+_HALVES, _POSITION_KEYS, _DRAWINGS = 0.1, 0.1, 0.1  # shares with keys of parts, of ground positions, and drawings
 
 # Validation.
 _VALIDATED_FRAMES = 192  # of the gap that is validated, 6.4 s; of shorter clips all but the ends
@@ -118,16 +113,11 @@ _VALIDATED_OF_KIND = 24
 class KeySequences:
     """A batch of sequences of one length."""
 
-    motion: PartialMotion
-    """Poses by frame; between keys of different clips they are anything finite."""
-    given: GivenParts
-    """Known parts of the frames that are keys."""
-    truthful: Bool[Tensor, "batch frames"]
-    """Whether the poses between the keys are a performer's."""
-    clip: Int[Tensor, "batch frames"]
-    """Number of the clip that a frame is of."""
-    mirrored: Bool[Tensor, " batch"]
-    """Whether left and right are exchanged."""
+    motion: PartialMotion  # poses by frame; between keys of different clips they are anything finite
+    given: GivenParts  # known parts of the frames that are keys
+    truthful: Bool[Tensor, "batch frames"]  # whether the poses between the keys are a performer's
+    clip: Int[Tensor, "batch frames"]  # number of the clip that a frame is of
+    mirrored: Bool[Tensor, " batch"]  # whether left and right are exchanged
 
     @property
     def known(self) -> Bool[Tensor, "batch frames"]:
@@ -143,6 +133,7 @@ class TweenerSettings(NetworkSettings):
     used_by = "use it with mapctl tween --method tweener --inbetweener"
     ours, papers = GeneratorConfig(), PAPER
     shape_options = ("paper",)
+    least_window = _LEAST_WINDOW
 
     steps: Count = 16_000
     """Steps in all."""
@@ -158,18 +149,13 @@ class TweenerSettings(NetworkSettings):
     """Class of a clip by its path below the data folder, for `mapctl tween --dna NAME`: what the first group matches;
     if not given, Bandai Namco's content, else the folder or the file's name without a number."""
 
-    def __post_init__(self):
-        super().__post_init__()
-        require_at_least(self, _LEAST_WINDOW, "window")
-
     def check(self) -> None:
         """Raise RequestError for what cannot be, before anything is read."""
         super().check()
         find_class("", self.labels)
-        path_predictor.load(self.path)
+        ConvPathPredictor.load(self.path)
 
     def make_trainer(self, parts: Split) -> "TweenerTrainer":
-        """Make the trainer as it is before the first step."""
         group_clips(parts.train.names, self.labels)  # what the end of training needs
         return TweenerTrainer(self, parts.train)
 
@@ -178,7 +164,7 @@ class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
     """Draws sequences, hides all but their keys, and brings the generator nearer to what was between."""
 
     def __init__(self, settings: TweenerSettings, corpus: Corpus):
-        self.path = path_predictor.load(settings.path).network.to(torch.get_default_device())
+        self.path = ConvPathPredictor.load(settings.path).network.to(torch.get_default_device())
         self.path.reduced_precision = settings.bfloat16
         self.windows = PoseWindows(corpus, evenness=1.0)
         self.longest = min(settings.window, int(int(self.windows.lengths.max()) / (1 + _TEMPO)) - 1)
@@ -193,7 +179,6 @@ class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
         return {"optimiser": torch.optim.Adam(self.network.parameters(), lr=rate, betas=(0.5, 0.9))}
 
     def losses(self) -> dict[str, Tensor]:
-        """Compute the losses of a newly drawn batch."""
         batch, progress, generator = self.settings.batch, self.progress, self.generator
         shortest, reach = min(_SHORTEST_WINDOW, self.longest), round(1.25 * find_longest_gap(progress))
         frames = self._draw_frames(shortest, min(self.longest, shortest + reach))
@@ -223,7 +208,7 @@ class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
         """Return the error of unseen gaps over slerp's, geometric mean over kinds of clips."""
         kinds = [name.removesuffix("_slerp_cm") for name, value in row.items() if name.endswith("_slerp_cm") and value]
         pairs = [(row.get(f"{kind}_error_cm"), row[f"{kind}_slerp_cm"]) for kind in kinds]
-        return average_logarithms(error / slerp for error, slerp in pairs if error is not None)
+        return geometric_mean(error / slerp for error, slerp in pairs if error is not None)
 
     def identify(self) -> Row:
         """Return the path predictor, which must not change between a run's parts."""
@@ -232,8 +217,8 @@ class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
     def export(self, parts: Split) -> Export:
         """Return the weights, with the path predictor and the classes for the card."""
         done = super().export(parts)
-        classes = compute_classes(self.network, parts.train, self.settings.labels)
-        done.data = {"path": checkpoints.compute_hash(self.settings.path), **classes}
+        classes = encode_classes(self.network.style, collect_dna(parts.train, self.settings.labels))
+        done.data = {**self.identify(), **classes}
         return done
 
 
@@ -243,10 +228,10 @@ def find_longest_gap(progress: float) -> float:
 
 
 def choose_parts(
-    known: Bool[Tensor, "batch frames"], heading: Float[Tensor, "batch frames"], partial: bool, rolls: Iterator[float]
+    known: Bool[Tensor, "batch frames"], heading: Float[Tensor, "batch frames"], rolls: Iterator[float]
 ) -> GivenParts:
     """Choose what is known in frames that are keys, of motions with these headings, radians: of most sequences all of
-    the pose, and of all of them unless `partial`."""
+    the pose."""
     whole = GivenParts.whole(known)
     axes, faced, view = whole.axes.clone(), whole.heading.clone(), whole.view.clone()
     for row in range(len(known)):
@@ -254,15 +239,15 @@ def choose_parts(
         runs = [slice(start, stop) for _, start, stop in true_intervals(known[row][:, None])]
         if not runs:
             continue
-        if partial and kind < _HALVES:
+        if kind < _HALVES:
             for run in runs:
                 axes[row, run] = _draw_part(rolls)[:, None]
-        elif partial and kind < _HALVES + _POSITION_KEYS:
+        elif kind < _HALVES + _POSITION_KEYS:
             kept = 0.4 * (next(rolls) < 0.6)
             for run in runs:
                 if next(rolls) >= kept:
                     axes[row, run], faced[row, run] = _GROUND_POSITION, False
-        elif partial and kind < _HALVES + _POSITION_KEYS + _DRAWINGS:
+        elif kind < _HALVES + _POSITION_KEYS + _DRAWINGS:
             view[row] = _draw_view(float(heading[row, runs[0].start]), rolls)
             for run in runs:
                 if next(rolls) < 0.75:
@@ -301,8 +286,7 @@ def _draw_view(heading: float, rolls: Iterator[float]) -> float:
 
 
 def _draw_drawing(rolls: Iterator[float]) -> Bool[Tensor, "joints 3"]:
-    """Draw which coordinates a drawing shows: two of all joints or of some; the third of the hips' if they are
-    placed."""
+    """Draw the coordinates that a drawing shows: two of all joints or of some; the hips' third if they are placed."""
     drawn = torch.ones(_JOINTS, dtype=torch.bool)
     if next(rolls) < 0.4:
         drawn = torch.tensor([next(rolls) < 0.7 for _ in range(_JOINTS)])
@@ -313,7 +297,7 @@ def _draw_drawing(rolls: Iterator[float]) -> Bool[Tensor, "joints 3"]:
 
 
 def draw_windows(
-    windows: PoseWindows, batch: int, frames: int, *, progress: float, generator: torch.Generator, partial: bool = True
+    windows: PoseWindows, batch: int, frames: int, *, progress: float, generator: torch.Generator
 ) -> KeySequences:
     """Draw windows of single clips, half of them up to the share _TEMPO slower or faster, and keys in them."""
     varied = torch.rand(batch, generator=generator) < 0.5
@@ -327,11 +311,11 @@ def draw_windows(
             row[start:stop] = True
     everywhere = torch.ones_like(known)
     clip = clip[:, None].expand_as(known)
-    return _finish(motion, known, everywhere, clip, partial, rolls, generator)
+    return _finish(motion, known, everywhere, clip, rolls, generator)
 
 
 def draw_splices(
-    windows: PoseWindows, batch: int, frames: int, *, progress: float, generator: torch.Generator, partial: bool = True
+    windows: PoseWindows, batch: int, frames: int, *, progress: float, generator: torch.Generator
 ) -> KeySequences:
     """Draw keys of several clips: of one under 3 s, above that of another one the likelier the longer the gap is."""
     rolls, longest = _roll(generator), find_longest_gap(progress)
@@ -347,8 +331,10 @@ def draw_splices(
             turn[row, during], shift[row, during] = part.turn, part.shift
             known[row, key] = True
             truthful[row, part.truthful_from : part.stop] = True
-    motion = _place(windows.gather(clip, time.double()), turn, shift)
-    return _finish(motion, known, truthful, clip, partial, rolls, generator)
+    motion = windows.gather(clip, time.double())
+    root = rotations.rotate_about_y(motion.root_position, turn) + rotations.lift_ground(shift)
+    motion = replace(motion, root_position=root, heading=motion.heading + turn)
+    return _finish(motion, known, truthful, clip, rolls, generator)
 
 
 @dataclass(frozen=True, eq=False)
@@ -439,32 +425,18 @@ def _roll(generator: torch.Generator) -> Iterator[float]:
         yield from torch.rand(_ROLLS, generator=generator).tolist()
 
 
-def _place(motion: PartialMotion, turn: Float[Tensor, "batch frames"], shift: Tensor) -> PartialMotion:
-    """Turn every frame about the origin, then shift it over the ground."""
-    root = rotations.rotate_about_y(motion.root_position, turn) + rotations.lift_ground(shift)
-    return replace(motion, root_position=root, heading=motion.heading + turn)
-
-
 def _finish(
     motion: PartialMotion,
     known: Tensor,
     truthful: Tensor,
     clip: Tensor,
-    partial: bool,
     rolls: Iterator[float],
     generator: torch.Generator,
 ) -> KeySequences:
     """Mirror half of the sequences, and choose what is known of keys."""
     mirrored = torch.rand(len(known), generator=generator) < 0.5
     motion = choose_rows(mirrored, motion.mirrored(), motion)
-    return KeySequences(motion, choose_parts(known, motion.heading, partial, rolls), truthful, clip, mirrored)
-
-
-def see_without_root(
-    positions: Float[Tensor, "*batch joints 3"], hips_world_matrix: Float[Tensor, "*batch 3 3"]
-) -> Float[Tensor, "*batch joints 3"]:
-    """Return positions from the hips without the hips' rotation."""
-    return positions @ hips_world_matrix
+    return KeySequences(motion, choose_parts(known, motion.heading, rolls), truthful, clip, mirrored)
 
 
 def compute_tweener_losses(
@@ -486,25 +458,33 @@ def compute_tweener_losses(
     wanted = image.positions - image.positions[..., :1, :]  # seen from the hips, as the generated poses
     local = motion.local_matrices()
     weight = _weigh_frames(known) * sequences.truthful
-    shown = _Errors(generated_poses.pose.positions, wanted)
+    between = torch.minimum(weight[:, 1:], weight[:, :-1])
+    off = generated_poses.pose.positions - wanted
+    steps, wanted_steps = (torch.diff(each, dim=1) for each in (generated_poses.pose.positions, wanted))
+    off_steps, planted = steps - wanted_steps, motion.contacts[:, 1:] * motion.contacts[:, :-1]
+    # Of joints but the hips, from which they are seen, the coordinates that are known.
+    off_known = (off * sequences.given.axes)[..., 1:, :]
+    joints_known = sequences.given.axes[..., 1:, :].any(dim=-1).float()
     heading = kinematics.heading_of_matrix(generated.local_matrix[..., 0, :, :])
     some = slice(0, -(-len(known) // _SOME))
-    turned = _length((generated.local_matrix[some] - local[some]).flatten(-2)).mean(dim=-1)
+    turned = measure_lengths((generated.local_matrix[some] - local[some]).flatten(-2), _LEAST).mean(dim=-1)
     whole = sequences.given.axes[some].flatten(2).all(dim=-1).float()
     terms = {
-        "positions": shown.positions(weight),
+        "positions": _average(measure_lengths(off, _LEAST).mean(dim=-1), weight),
         "turns": _average(turned, weight[some]),
-        "pace": shown.pace(_between(weight)),
-        "activity": shown.activity(sequences.truthful),
-        "feet": shown.feet(motion, _between(weight)),
-        "keys": shown.keys(sequences.given) + 0.1 * _average(turned, whole),
+        "pace": _average(measure_lengths(off_steps, _LEAST).mean(dim=-1), between),
+        "activity": _compute_activity_error(steps, wanted_steps, sequences.truthful),
+        "feet": _average(measure_lengths(off_steps[..., list(TOE_JOINTS), :], _LEAST), planted * between[..., None]),
+        "keys": _average(measure_lengths(off_known, _LEAST), joints_known) + 0.1 * _average(turned, whole),
     }
     trajectory = path(LocalMotion.of_world(generated.positions[some], heading[some]))
     travelled = trajectory.integrate(heading[some])
     terms |= _compute_path_terms(trajectory, travelled, sequences, some)
-    without_root = see_without_root(generated.positions, generated.local_matrix[..., 0, :, :])
+    without_root = generated.positions @ generated.local_matrix[..., 0, :, :]
     apart = torch.cdist(style_poses.flatten(-2), without_root.flatten(-2)) / len(CANONICAL.names) ** 0.5
-    terms["style"] = _compute_style_error(apart, styled)
+    # How far the style's poses are from the nearest generated ones that are held for some frames (Eq. 11).
+    nearest = avg_pool1d(apart, _DWELL, stride=1).amin(dim=-1)
+    terms["style"] = _average(nearest.mean(dim=-1), styled.float())
     terms["dwell"] = _compute_dwell_error(apart, known, styled)
     terms["regularisation"] = regularise_batch(tuple(each[some] for each in generated_poses.responses))
     loss = torch.stack([WEIGHTS[name] * value for name, value in terms.items()]).sum()
@@ -512,44 +492,20 @@ def compute_tweener_losses(
     return {"loss": loss, **shown_cm, **{name: terms[name] for name in ("turns", "contacts", "regularisation")}}
 
 
-class _Errors:
-    """Errors of positions, seen from the hips along the reference, weighed by frame."""
-
-    def __init__(
-        self, generated: Float[Tensor, "batch frames joints 3"], wanted: Float[Tensor, "batch frames joints 3"]
-    ):
-        self.off = generated - wanted
-        self.generated_steps, self.wanted_steps = torch.diff(generated, dim=1), torch.diff(wanted, dim=1)
-        self.off_steps = self.generated_steps - self.wanted_steps
-
-    def positions(self, weight: Tensor) -> Tensor:
-        return _average(_length(self.off).mean(dim=-1), weight)
-
-    def pace(self, weight: Tensor) -> Tensor:
-        return _average(_length(self.off_steps).mean(dim=-1), weight)
-
-    def activity(self, truthful: Tensor) -> Tensor:
-        """Compare speeds and accelerations by joint, whenever within a second they are."""
-        if truthful.shape[1] < _ACTIVITY_FRAMES + 2:
-            return self.off.new_zeros(())
-        error = self.off.new_zeros(())
-        for times in (0, 1):
-            generated, wanted = (
-                _length(torch.diff(each, n=times, dim=1)) for each in (self.generated_steps, self.wanted_steps)
-            )
-            counts = _average_seconds(truthful[:, 1 + times :, None].float())[..., 0] > 0.999
-            off = (_average_seconds(generated) - _average_seconds(wanted)).abs().mean(dim=-1)
-            error = error + _average(off, counts)
+def _compute_activity_error(
+    steps: Float[Tensor, "batch later joints 3"], wanted: Float[Tensor, "batch later joints 3"], truthful: Tensor
+) -> Tensor:
+    """Compare speeds and accelerations by joint, whenever within a second they are."""
+    error = steps.new_zeros(())
+    if truthful.shape[1] < _ACTIVITY_FRAMES + 2:
         return error
-
-    def keys(self, given: GivenParts) -> Tensor:
-        """Compare the coordinates that are known at keys, of joints but the hips, from which they are seen."""
-        joints = given.axes[..., 1:, :].any(dim=-1).float()
-        return _average(_length((self.off * given.axes)[..., 1:, :]), joints)
-
-    def feet(self, motion: PartialMotion, weight: Tensor) -> Tensor:
-        planted = motion.contacts[:, 1:] * motion.contacts[:, :-1]
-        return _average(_length(self.off_steps[..., list(TOE_JOINTS), :]), planted * weight[..., None])
+    for times in (0, 1):
+        speed, true = (
+            _average_seconds(measure_lengths(torch.diff(each, n=times, dim=1), _LEAST)) for each in (steps, wanted)
+        )
+        counts = _average_seconds(truthful[:, 1 + times :, None].float())[..., 0] > 0.999
+        error = error + _average((speed - true).abs().mean(dim=-1), counts)
+    return error
 
 
 def _compute_path_terms(
@@ -571,15 +527,9 @@ def _compute_path_terms(
     nats = cross_entropy(trajectory.contacts, contacts, reduction="none").mean(dim=-1)
     return {
         "path": torch.stack(errors).mean() + height,
-        "root": (_length(off) * share).sum(dim=1).mean(),
+        "root": (measure_lengths(off, _LEAST) * share).sum(dim=1).mean(),
         "contacts": _average(nats, _weigh_frames(known) * truthful),
     }
-
-
-def _compute_style_error(apart: Float[Tensor, "batch poses frames"], counts: Bool[Tensor, " batch"]) -> Tensor:
-    """How far the style's poses are from the nearest generated ones that are held for some frames (Eq. 11), metres."""
-    nearest = avg_pool1d(apart, _DWELL, stride=1).amin(dim=-1)
-    return _average(nearest.mean(dim=-1), counts.float())
 
 
 def _compute_dwell_error(
@@ -610,17 +560,8 @@ def _average_seconds(values: Float[Tensor, "batch frames columns"]) -> Float[Ten
     return avg_pool1d(values.transpose(1, 2), _ACTIVITY_FRAMES).transpose(1, 2)
 
 
-def _between(weight: Float[Tensor, "batch frames"]) -> Tensor:
-    return torch.minimum(weight[:, 1:], weight[:, :-1])
-
-
 def _average(values: Tensor, weight: Tensor) -> Tensor:
     return (values * weight).sum() / weight.sum().clamp_min(1e-6)
-
-
-def _length(vectors: Tensor) -> Tensor:
-    """Length with a gradient at 0."""
-    return vectors.square().sum(dim=-1).add(1e-8).sqrt()
 
 
 def _set_moments(network: GeneratorNetwork, windows: PoseWindows) -> None:
@@ -655,8 +596,7 @@ def draw_style_poses(
 
 @torch.no_grad()
 def measure_kinds(network: GeneratorNetwork, corpus: Corpus) -> dict[str, Any]:
-    """Measure gaps between two poses by kind of clips: error beside slerp's, cm, and speed, spread and jerk over
-    mocap's, of sums."""
+    """Measure gaps by kind of clips: error beside slerp's, cm, and speed, spread and jerk over mocap's, of sums."""
     windows = PoseWindows(corpus, evenness=1.0)
     kind_of = [find_kind(name) for name in corpus.names]
     row: dict[str, Any] = {}
@@ -709,19 +649,15 @@ CLIPS_OF_CLASS = 24
 """Clips of a class that its vector is the mean of, at most: evenly among all of them by name."""
 
 
-def compute_classes(network: GeneratorNetwork, corpus: Corpus, labels: str = LABELS) -> dict[str, Any]:
-    """Compute the classes of a corpus, for the data of a card; RequestError for labels of one's own that no clip
-    has."""
-    return encode_classes(network.style, collect_dna(corpus, labels))
-
-
 def collect_dna(corpus: Corpus, labels: str = LABELS) -> Mapping[str, Sequence[MotionDna]]:
-    """Collect the poses of clips by class."""
-    clips = corpus.clips()
-    return {
-        name: [_take_poses(clips[numbers[at]]) for at in _spread(len(numbers))]
-        for name, numbers in group_clips(corpus.names, labels).items()
-    }
+    """Collect the poses of clips by class; RequestError for labels of one's own that no clip has."""
+    clips, found = corpus.clips(), dict[str, list[MotionDna]]()
+    for name, numbers in group_clips(corpus.names, labels).items():
+        taken = min(len(numbers), CLIPS_OF_CLASS)
+        poses = [BodyPose.of_features_in_place(clips[numbers[at * len(numbers) // taken]]) for at in range(taken)]
+        quats = [rotations.from_rotation_vector(pose.rotation_vectors) for pose in poses]
+        found[name] = [motion_dna.of_rotations(each) for each in quats]
+    return found
 
 
 def group_clips(names: Sequence[str], labels: str = LABELS) -> dict[str, list[int]]:
@@ -733,14 +669,3 @@ def group_clips(names: Sequence[str], labels: str = LABELS) -> dict[str, list[in
     if not members and labels != LABELS:
         raise RequestError(f"--labels {labels!r} matches no clip, such as {names[0]!r}")
     return members
-
-
-def _spread(count: int) -> list[int]:
-    """Spread so many numbers as clips are taken evenly over a count."""
-    taken = min(count, CLIPS_OF_CLASS)
-    return [number * count // taken for number in range(taken)]
-
-
-def _take_poses(features: torch.Tensor) -> MotionDna:
-    pose = BodyPose.of_features_in_place(features)
-    return motion_dna.of_rotations(rotations.from_rotation_vector(pose.rotation_vectors))
