@@ -63,12 +63,13 @@ class Filling:
         first, last = max(0, start - _CONTEXT), min(self.motion.num_frames, stop + _CONTEXT)
         gap = (max(1, start - first), min(stop, self.motion.num_frames - 1) - first)
         part, missing = self.motion.slice(first, last), self.missing.slice(first, last)
-        if not bool(missing.frames.any()):
-            return 0.0
-        done = fill(part, missing, inbetweener, settings=InfillSettings(refine=False))
-        shown = done.motion.slice(max(0, gap[0] - 2), min(done.motion.num_frames, gap[1] + 2))
+        planted = contacts.detect_contacts(part.joint_positions()[:, _TOES], part.fps)
+        if bool(missing.frames.any()):
+            done = fill(part, missing, inbetweener, settings=InfillSettings(refine=False))
+            part, planted = done.motion, done.contacts
+        shown = part.slice(max(0, gap[0] - 2), min(part.num_frames, gap[1] + 2))
         peaks = body.measure_peaks(shown.joint_positions()[:, _EFFECTORS], shown.root_position, float(shown.fps))
-        return compute_artefact_cost(done.motion, done.contacts, gap) + _ACCELERATION_WEIGHT * peaks.acceleration
+        return compute_artefact_cost(part, planted, gap) + _ACCELERATION_WEIGHT * peaks.acceleration
 
 
 def choose_filling(candidates: Sequence[Filling], inbetweener: Inbetweener) -> int:
@@ -229,20 +230,27 @@ def _lay_transitions(before: Span, after: Span, frames: int, earliest: int) -> l
 
 
 _REST, _SOON = 24, 45  # frames in which limbs come to rest, or until the first step where it ends that soon
+_SEAMS = (0, 10, 18, 26)  # frames after a clip's last that are tried as its seam
 
 
 def go_on(motion: Motion, missing: Bool[Tensor, " frames"], lead: Lead, inbetweener: Inbetweener) -> Motion:
-    """Generate the missing frames of a shot that continues from a clip; where that ends in a gesture, limbs come to
-    rest until the first step, by the motion of the clip's last frames."""
-    if not lead.gestures:
-        return fill_frames(motion, missing, inbetweener)
-    first = next(((start, stop) for _, start, stop in true_intervals(missing[:, None].clone())), None)
-    rest = first[1] if first is not None and first[0] < _SOON else min(_REST, motion.num_frames - 1)
-    missing = missing.clone()
-    missing[1:rest] = True
+    """Generate the missing frames of a shot that continues from a clip, and those after the clip's last, by the motion
+    before it: where that ends in a gesture, limbs come to rest until the first step; where it walks in a style that the
+    density does not know, a seam costs a viewer less than a jump."""
     past = lead.past
-    whole = fill_frames(past.join(motion), torch.cat([missing.new_zeros(past.num_frames), missing]), inbetweener)
-    return whole.slice(past.num_frames, whole.num_frames)
+    count = past.num_frames
+    if lead.gestures:
+        first = next(((start, stop) for _, start, stop in true_intervals(missing[:, None].clone())), None)
+        rest = first[1] if first is not None and first[0] < _SOON else min(_REST, motion.num_frames - 1)
+        missing = missing.clone()
+        missing[1:rest] = True
+        whole = fill_frames(past.join(motion), torch.cat([missing.new_zeros(count), missing]), inbetweener)
+    else:
+        whole = past.join(fill_frames(motion, missing, inbetweener) if bool(missing.any()) else motion)
+        if not lead.stands:
+            tried = [Filling.of_frames(whole, count + 1, count + 1 + width) for width in _SEAMS]
+            whole = _fill_best([replace(each, around=(count + 1, count + 27)) for each in tried], inbetweener)
+    return whole.slice(count, whole.num_frames)
 
 
 def arrive(motion: Motion, arrival: Arrival, inbetweener: Inbetweener) -> Motion:
@@ -263,6 +271,8 @@ def arrive(motion: Motion, arrival: Arrival, inbetweener: Inbetweener) -> Motion
 
 def _fill_best(tried: Sequence[Filling], inbetweener: Inbetweener) -> Motion:
     chosen = tried[choose_filling(tried, inbetweener)]
+    if not bool(chosen.missing.frames.any()):
+        return chosen.motion
     return fill(chosen.motion, chosen.missing, inbetweener).motion
 
 

@@ -163,26 +163,27 @@ def lay_stands(spans: Sequence[Span], trajectory: "Trajectory", request: ShotReq
 
 def _split_at_keys(span: Span, trajectory: "Trajectory", keys: Sequence[PoseKey]) -> list[Span]:
     """Split a stand at the keys for which a foot has to step, and there is time to: there, and back again after it."""
-    found, base = list[Span](), span.pose
+    found, base = [span], span.pose
     assert base is not None
     for key in sorted(keys, key=lambda key: key.seconds):
         first = round(key.seconds * PRIOR_FPS)
         stop = min(span.stop, first + round(key.hold_seconds * PRIOR_FPS) + 1)
-        now = replace(span, pose=base) if not found else found[-1]
-        assert now.pose is not None
-        if not span.start < first < span.stop:
+        now = found[-1]
+        if not max(1, now.start) <= first < span.stop:
             continue
         asked = trajectory.pose_at_key(base, key, first)
-        there, back = Displacement.between(now.pose, asked), Displacement.between(asked, base)
+        there, back = Displacement.between(now.pose or base, asked), Displacement.between(asked, base)
         leave, home = first - there.count_frames() + 1, stop + back.count_frames() - 2
-        if leave <= now.start or not there.moves_feet:
+        if not there.moves_feet or (leave <= now.start and now.start == 0):
             continue
-        found[-1:] = [replace(now, stop=leave + 1), Span("stand", first, stop, asked)]
+        # A walk that leads into the stand shortly before the key ends in it.
+        before = [replace(now, stop=leave + 1)] if leave > now.start else []
+        found[-1:] = [*before, Span("stand", first if before else now.start, stop, asked)]
         if home < span.stop:
             found.append(Span("stand", home, span.stop, base))
         else:
             found[-1] = replace(found[-1], stop=span.stop)
-    return found or [span]
+    return found
 
 
 def lay_timeline(speeds: Float[Tensor, " frames"], *, slowest: float) -> list[Span]:

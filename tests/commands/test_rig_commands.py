@@ -32,6 +32,7 @@ from mapctl.solver.budget import Budget
 from mapctl.terms import FootContact
 
 QUICK = FollowSettings(
+    liveliness=0.0,  # which other numbers would amplify
     window=HorizonSettings(frames=10, overlap=4, past=12),
     method=LatentNoiseSolver(rounds=1, budget=Budget(evaluations=5)),
 )
