@@ -344,10 +344,13 @@ def _find_met(motion: Motion, key: PoseKey, trajectory: Trajectory) -> MetPose |
 def measure_pose_error(motion: Motion, met: MetPose) -> tuple[float, float]:
     """Measure the largest distance of what a key gives from where it is to be, metres, and of the heading, degrees."""
     held = motion.slice(met.start, met.stop)
-    away = (held.joint_positions() - met.wanted.joint_positions()).norm(dim=-1)
-    counted = away if met.key.gives_body else away[:, :1]
+    away = held.joint_positions() - met.wanted.joint_positions()
+    if not met.key.gives_body:
+        away = away[:, :1]
+    if met.key.pose is None and met.key.height is None:
+        away = away[..., ::2]
     turned = _measure_turns(held, met.wanted)
-    return float(counted.max()), float(torch.rad2deg(turned.max()))
+    return float(away.norm(dim=-1).max()), float(torch.rad2deg(turned.max()))
 
 
 def as_reaches(keys: Sequence[PoseKey], trajectory: Trajectory, found: Motion) -> tuple[Reach, ...]:

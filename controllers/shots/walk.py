@@ -139,7 +139,7 @@ TAIL = 14
 """Frames that a walk goes on for a later last step."""
 _TOES = list(CANONICAL.indices(TOES))
 _TRIES = 5  # walks of a span, of which the first that passes is taken, or the best
-_MOST_OFF, _MOST_BENT = 0.3, 70.0  # metres from where the hips were to be; m/s^2 of a toe: a circle's is 45
+_MOST_OFF, _MOST_BENT = 0.3, 70.0  # metres from where hips of the prior's size were to be; m/s^2 of a toe
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,7 +225,7 @@ def walk_spans(
                 if outcome is Outcome.INTERRUPTED:  # half a shot is none: its other half would stand still
                     raise KeyboardInterrupt
                 raise MapctlError(f"the walk from frame {span.start} on {outcome.value}")
-            fault = _measure_fault(motion, curve.ground_point(arcs[:length]))
+            fault = _measure_fault(motion, curve.ground_point(arcs[:length])) / character.scale
             if fault < least:
                 best, least = (motion, done), fault
             if fault <= 1:

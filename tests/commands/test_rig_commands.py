@@ -32,9 +32,9 @@ from mapctl.solver.budget import Budget
 from mapctl.terms import FootContact
 
 QUICK = FollowSettings(
-    liveliness=0.0,  # which other numbers would amplify
+    liveliness=0.0,
     window=HorizonSettings(frames=10, overlap=4, past=12),
-    method=LatentNoiseSolver(rounds=1, budget=Budget(evaluations=5)),
+    method=LatentNoiseSolver(rounds=1, budget=Budget(evaluations=15)),
 )
 SIZE = 1.3
 
