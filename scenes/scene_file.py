@@ -65,7 +65,8 @@ class Actor(ShotOptions):
     __pydantic_config__ = STRICT
 
     curve: Annotated[str, Field(min_length=1)] | None = None
-    """A built-in shape (`circle:4`) or a CSV or SVG file, relative to the scene file; without one the actor stays."""
+    """A built-in shape (`circle:4`) or a CSV or SVG file, relative to the scene file, or one path of a drawing
+    (`drawing.svg#walk`); without one the actor stays."""
     name: Annotated[str, Field(pattern=r"^[\w-]+$")] = ""
     """Used in file names; `actor1`, `actor2`, ... if not given."""
     colour: str | None = None
@@ -207,8 +208,7 @@ def load(path: str | PathLike[str]) -> tuple[SceneDescription, tuple[Curve, ...]
 def transform_curve(actor: Actor, folder: Path) -> Curve:
     """Rotate and move the actor's curve into the world; files are relative to `folder`."""
     text = _STAY if actor.curve is None else actor.curve
-    is_file = PurePath(text).suffix.lower() in (".csv", ".svg")
-    curve = curves.read(folder / text if is_file else text)
+    curve = curves.read(text, folder=folder)
     points = curve.points.numpy().copy()
     angle = np.radians(actor.turn_deg or 0.0)
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])

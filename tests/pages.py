@@ -42,7 +42,8 @@ def blocks(page: str, language: str) -> list[Block]:
 
 def commands(page: str) -> list[str]:
     """The lines of its fenced blocks that call mapctl."""
-    lines = [line.split(" #")[0].strip() for block in blocks(page, "") for line in block.text.splitlines()]
+    text = "".join(block.text for language in ("", "sh") for block in blocks(page, language)).replace("\\\n", "")
+    lines = [line.split(" #")[0].strip() for line in text.splitlines()]
     return [line for line in lines if line.startswith("mapctl ")]
 
 
@@ -54,7 +55,7 @@ def inline_commands(page: str) -> list[str]:
 
 
 def write_files(folder: Path) -> None:
-    """Write all that the pages' Python names: clips, folders of clips, a character, and a small model."""
+    """Write all that README.md and the pages' Python name: clips, folders of clips, a character, and a small model."""
     save_tiny_infiller(folder / "infiller.safetensors", drawn=0.02)
     ours = make(Make(names_of("lafan1")))
     for name, frames in (("take", 260), ("keys", 125), ("wave", 60)):

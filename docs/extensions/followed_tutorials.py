@@ -1,36 +1,44 @@
 """Follow each tutorial before the site is built, so that its pictures are those of its steps.
 
-The fenced blocks of docs/tutorials/NAME.md run in order, in an empty folder: ```sh by a shell, ```python by one
-interpreter a block. A step that fails ends the build. Pictures are kept in `made/NAME`, which the page shows, and made
-again when the text or the version of mapctl changes.
+Pictures are kept in `made/NAME`, which the page shows; a new text or version of mapctl writes them again.
 """
 
 import hashlib
-import os
 import re
 import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from sphinx.application import Sphinx
-from sphinx.errors import ExtensionError
 
 from mapctl import __version__
 
 _PICTURES = (".png", ".gif", ".jpg", ".webp")
-_STEP = re.compile(r"^```(sh|python)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+_BLOCK = re.compile(r"^```(sh|python|text)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+_COMMAND = f'mapctl() {{ "{sys.executable}" -m mapctl "$@"; }}\n'
+_NOT_HELD = ("NOT HELD", "the constraints cannot all hold")
 
 
-def _follow(page: Path, folder: str) -> None:
-    environment = dict(os.environ, PATH=os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]))
-    for number, (language, step) in enumerate(_STEP.findall(page.read_text("utf-8")), start=1):
-        words = ["sh", "-eu"] if language == "sh" else [sys.executable, "-"]
-        done = subprocess.run(words, input=step, cwd=folder, env=environment, capture_output=True, text=True)
-        if done.returncode != 0:
-            raise ExtensionError(f"{page.name}, step {number}, ended with {done.returncode}:\n{done.stderr[-2000:]}")
+def follow(page: Path, folder: str | Path) -> None:
+    """Run the fenced blocks of a page in order, ```sh by a shell and ```python by one interpreter a block; or a script.
+
+    RuntimeError for one that fails, and for a request that is not held unless the next block, ```text, shows that.
+    """
+    text = page.read_text("utf-8")
+    blocks = [("python", text)] if page.suffix == ".py" else _BLOCK.findall(text)
+    for (language, block), (_, shown) in pairwise([*blocks, ("", "")]):
+        if language == "text":
+            continue
+        words, block = (["sh", "-eu"], _COMMAND + block) if language == "sh" else ([sys.executable, "-"], block)
+        done = subprocess.run(
+            words, input=block, cwd=folder, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+        )
+        if done.returncode or any(mark in done.stdout and mark not in shown for mark in _NOT_HELD):
+            raise RuntimeError(f"{page.name}, exit status {done.returncode}:\n{block}\n{done.stdout[-2000:]}")
 
 
 def _keep_pictures(page: Path) -> None:
@@ -41,7 +49,7 @@ def _keep_pictures(page: Path) -> None:
     shutil.rmtree(kept, ignore_errors=True)
     kept.mkdir(parents=True)
     with TemporaryDirectory() as folder:
-        _follow(page, folder)
+        follow(page, folder)
         for picture in Path(folder).rglob("*"):
             if picture.suffix in _PICTURES:
                 shutil.copy(picture, kept)

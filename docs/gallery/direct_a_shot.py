@@ -31,6 +31,7 @@ shot = solve_shot(priors.load("locomotion"), priors.load_transformer(), request)
 
 for constraint in shot.constraints:
     print(f"{constraint.name} ({constraint.asked}): {constraint.got:.1f} {constraint.unit}")
+print(shot.status.text)
 
 # %%
 # The planned path (red) leads round the pillar. The ball shines while it is a target.

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import priors
 from controllers.common.character import Character
-from mapctl import report
-from mapctl.commands.shared import inputs, options, outputs
+from mapctl import curves, report
+from mapctl.commands.shared import options, outputs
 from mapctl.commands.shared.command import INTERRUPTED, ModelCommand
 from mapctl.commands.shared.outputs import show_progress
 from mapctl.commands.shared.shots import plan_shot, play_shot
@@ -52,7 +52,7 @@ def run(command: Demo) -> int:
             outputs.require_render(*packages, "matplotlib" if find_spec("pyrender") is None else "pyrender")
         except RequestError as error:
             missing[ending] = str(error)
-    actor, curve = Actor(curve=CURVE, speed=SPEED, seed=command.seed), inputs.read_curve(CURVE, None)
+    actor, curve = Actor(curve=CURVE, speed=SPEED, seed=command.seed), curves.read(CURVE)
     plan = plan_shot(
         actor, curve, priors.load(command.prior), character=Character(), folder=Path(), options=options.ReadOptions()
     )

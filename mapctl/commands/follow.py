@@ -8,7 +8,7 @@ from typing import Annotated
 from tyro.conf import Positional, UseAppendAction, arg
 
 import priors
-from mapctl import formats
+from mapctl import curves, formats
 from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.command import ModelCommand, conclude
 from mapctl.commands.shared.outputs import show_progress
@@ -27,7 +27,7 @@ class FollowCurve(ModelCommand, options.ReadOptions, ShotOptions):
 
     curve: Positional[options.CurveText]
     """circle:4, figure8:2, s:6, line:10, wave:1x8 (metres), a CSV file of x,z or, with heights of the hips,
-    x,y,z, or an SVG file."""
+    x,y,z, or an SVG file; drawing.svg#walk or drawing.svg#2 is one of its paths, by id, label or number from 1."""
     out: options.OutFile
     """Output file: .bvh, .npz, .glb or .usda."""
     speed: options.MaybeSpeed = None
@@ -88,7 +88,7 @@ def _follow(command: FollowCurve, file: ShotKeyFile | None) -> int:
         raise RequestError(f"--{actor.fault}")
     plan = plan_shot(
         actor,
-        inputs.read_curve(command.curve, command.metres_per_unit),
+        curves.read(command.curve, metres_per_unit=command.metres_per_unit),
         priors.load(command.prior),
         character=inputs.read_character(command.rig, command),
         folder=Path(),

@@ -10,6 +10,7 @@ from tyro.conf import UseAppendAction, arg
 import priors
 from controllers.inbetweening.infill import InbetweenSolution, InfillSettings, infill, retraced
 from controllers.inbetweening.proposers import build_inbetweener
+from mapctl import curves
 from mapctl.commands.shared import inputs, options, results
 from mapctl.commands.shared.command import ModelCommand, conclude
 from mapctl.commands.shared.options import parse_ranges
@@ -121,6 +122,6 @@ def _run_infilling(
         settings=settings,
         densities=densities,
         rig=rig,
-        curve=None if command.curve is None else inputs.read_curve(command.curve, None),
+        curve=None if command.curve is None else curves.read(command.curve),
         generator=generator,
     )

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from tyro.conf import Positional, arg
 
-from mapctl import editing, formats, metrics, report, retarget
+from mapctl import curves, editing, formats, metrics, report, retarget
 from mapctl.commands.shared import inputs, options
 from mapctl.commands.shared.command import ModelCommand
 from mapctl.commands.shared.inputs import read_motion
@@ -73,7 +73,7 @@ def _measure_clips(command: Measure, mixed: bool) -> dict[str, Any]:
         raise RequestError(f"speed must be positive, got {command.speed:g} m/s")
     if command.curve is None and (command.speed is not None or command.metres_per_unit is not None):
         raise RequestError("--speed and --metres-per-unit are about a curve; name it with --curve")
-    curve = None if command.curve is None else inputs.read_curve(command.curve, command.metres_per_unit)
+    curve = None if command.curve is None else curves.read(command.curve, metres_per_unit=command.metres_per_unit)
     rig = inputs.read_rig(command.rig, command)
     whole = inputs.read_motion(command.clip, rig)
     clip, notes = _make_comparable(whole, command.clip, rig)

@@ -5,6 +5,7 @@ from typing import Annotated
 
 from tyro.conf import arg
 
+from mapctl import curves
 from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.command import Command
 from mapctl.commands.shared.outputs import show_progress
@@ -45,7 +46,7 @@ def run(command: Render) -> int:
     """Check, film, report."""
     size = options.parse_size(command.size)
     outputs.check_film(command.out, size)
-    curve = None if command.curve is None else inputs.read_curve(command.curve, command.metres_per_unit)
+    curve = None if command.curve is None else curves.read(command.curve, metres_per_unit=command.metres_per_unit)
     rig = inputs.read_rig(command.rig, command)
     motion = inputs.read_motion(command.source, rig, quiet=command.quiet)
     shot, notes = _prepare_shot(motion, rig, curve, command.character)

@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 from os import PathLike
 from pathlib import Path
 
@@ -135,25 +136,32 @@ def through(points: Float[Tensor, "points dims"] | ndarray, *, closed: bool = Fa
     return from_points(spline(fine), closed=is_loop)
 
 
-def read(source: str | PathLike[str], *, metres_per_unit: float | None = None) -> Curve:
-    """Read the curve that a shape (`circle:4`, `wave:1x8`), a CSV file or an SVG file (by its ending) describes.
+def read(
+    source: str | PathLike[str], *, metres_per_unit: float | None = None, folder: str | PathLike[str] = ""
+) -> Curve:
+    """Read the curve that a shape (`circle:4`, `wave:1x8`), a CSV file or an SVG file (by its ending) describes, or one
+    path of an SVG file, by id, Inkscape's label or number (`drawing.svg#walk`, `drawing.svg#2`).
 
-    `metres_per_unit` scales a file's numbers; by default a CSV is in metres and 100 SVG units are a metre. RequestError
-    for shapes and scales that cannot be; FileFormatError, with its line, for files.
+    `metres_per_unit` scales a file's numbers; by default a CSV is in metres and 100 SVG units are a metre. Files are
+    relative to `folder`. RequestError for shapes and scales that cannot be; FileFormatError, with its line, for files.
     """
     text = os.fspath(source)
     if metres_per_unit is not None and not 1e-9 <= metres_per_unit <= 1e9:
         raise RequestError(f"metres per unit must be a positive number, got {metres_per_unit:g}")
-    if Path(text).suffix.lower() in _FILE_ENDINGS or (text and ":" not in text and Path(text).exists()):
-        return _read_file(text, metres_per_unit)
+    drawing = re.fullmatch(r"(.*?\.svg)#(.*)", text, re.IGNORECASE | re.DOTALL)
+    file, name = drawing.groups() if drawing else (text, None)
+    path = os.path.join(folder, file)  # noqa: PTH118
+    is_path = any(mark in file for mark in (os.sep, os.altsep) if mark)
+    if Path(file).suffix.lower() in _FILE_ENDINGS or is_path or (file and ":" not in file and Path(path).exists()):
+        return _read_file(path, metres_per_unit, name)
     if metres_per_unit is not None:
         raise RequestError(f"metres per unit is for files; the curve {text!r} is in metres")
     return _parse_shape(text)
 
 
-def _read_file(path: str, metres_per_unit: float | None) -> Curve:
+def _read_file(path: str, metres_per_unit: float | None, name: str | None) -> Curve:
     if path.lower().endswith(".svg"):
-        points = files.read_svg(path, metres_per_unit or files.SVG_METRES_PER_UNIT)
+        points = files.read_svg(path, metres_per_unit or files.SVG_METRES_PER_UNIT, name)
     else:
         points = files.read_csv(path) * (metres_per_unit or 1.0)
     try:

@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from mapctl.curves.curve import MAX_LENGTH, MAX_POINTS
 from mapctl.errors import FileFormatError
-from mapctl.formats.text import finite_number, read_bytes, shorten
+from mapctl.formats.text import finite_number, one_line, read_bytes, shorten
 
 _MAX_CSV_BYTES = 64 * 2**20
 _COLUMNS = (("x", "z"), ("x", "y", "z"))
@@ -77,39 +77,51 @@ def _split_line(line: str) -> list[str]:
 _MAX_SVG_BYTES, _MAX_SVG_SEGMENTS = 2 * 2**20, 30_000  # its parser takes seconds for a megabyte
 SVG_METRES_PER_UNIT = 0.01
 """Scale of a drawing unless asked otherwise: 100 SVG units are a metre."""
+_INKSCAPE_LABEL = "{http://www.inkscape.org/namespaces/inkscape}label"
 
 
-def read_svg(path: str | PathLike[str], metres_per_unit: float = SVG_METRES_PER_UNIT) -> ndarray:
+def read_svg(
+    path: str | PathLike[str], metres_per_unit: float = SVG_METRES_PER_UNIT, name: str | None = None
+) -> ndarray:
     """Read points (n, 2) along a drawing, metres.
 
     SVG x is world x and SVG y, which points down the page, is world z: the page is the ground from above. The curve is
     the drawing's paths, which must touch end to start; without any <path>, its lines, polylines, circles and the like.
-    Transforms are applied. FileFormatError for a file that is no such drawing.
+    `name` selects among them: an id, else Inkscape's label, else a number from 1. Transforms are applied.
+    FileFormatError for a file that is no such drawing.
     """
-    pieces = [_sample_segment(path, segment, metres_per_unit) for segment in _read_segments(path, metres_per_unit)]
+    segments = _read_segments(path, metres_per_unit, name)
+    pieces = [_sample_segment(path, segment, metres_per_unit) for segment in segments]
     points = np.concatenate(pieces)
     if len(points) > MAX_POINTS:
         raise FileFormatError(path, f"needs more than {MAX_POINTS} points; is --metres-per-unit right?")
     return points
 
 
-def _read_segments(path: str | PathLike[str], metres_per_unit: float) -> list:
+def _read_segments(path: str | PathLike[str], metres_per_unit: float, name: str | None) -> list:
     """Read the path segments in drawing order, each of which starts where the one before ended."""
-    segments = [segment for drawn in _read_svg_paths(path) for segment in drawn]
-    if not segments:
+    paths = _read_svg_paths(path)
+    if not paths:
         raise FileFormatError(path, "holds no drawn path")
+    keys = [(each.element.get("id"), each.element.get(_INKSCAPE_LABEL), str(n)) for n, each in enumerate(paths, 1)]
+    listed = one_line(", ".join(f"#{i or n}" + (f" ({label})" if label else "") for i, label, n in keys), 300)
+    found = ([each for each, key in zip(paths, keys, strict=True) if key[kind] == name] for kind in range(3))
+    chosen = paths if name is None else next(filter(None, found), None)
+    if chosen is None:
+        raise FileFormatError(path, f"holds no path {shorten(name or '')}; choose one: {listed}")
+    segments = [segment for drawn in chosen for segment in drawn]
     if len(segments) > _MAX_SVG_SEGMENTS:
         raise FileFormatError(path, f"holds {len(segments)} path segments, allowed are {_MAX_SVG_SEGMENTS}")
     for before, after in pairwise(segments):
         gap = abs(after.start - before.end) * metres_per_unit
         if gap > 1e-3:
-            raise FileFormatError(
-                path, f"holds paths that do not touch ({gap:.3g} m apart); join them or keep only one"
-            )
+            choice = f", or add one of them to the file's name: {listed}" if len(chosen) > 1 else ""
+            raise FileFormatError(path, f"holds paths that do not touch ({gap:.3g} m apart); join them{choice}")
     return segments
 
 
 def _read_svg_paths(path: str | PathLike[str]) -> list:
+    """Read the drawing's paths that are not empty, in its order."""
     from svgpathtools.document import CONVERSIONS, CONVERT_ONLY_PATHS, Document  # slow to import
 
     text = _read_text(path, _MAX_SVG_BYTES, "an SVG drawing")
@@ -121,7 +133,9 @@ def _read_svg_paths(path: str | PathLike[str]) -> list:
                 element.tag = "{http://www.w3.org/2000/svg}" + element.tag
         with warnings.catch_warnings(action="ignore"):
             paths = document.paths(path_conversions=CONVERT_ONLY_PATHS)
-            return paths or document.paths(path_conversions=CONVERSIONS)
+            paths = paths or document.paths(path_conversions=CONVERSIONS)
+        order = {element: number for number, element in enumerate(document.tree.iter())}
+        return sorted(filter(len, paths), key=lambda drawn: order[drawn.element])
     except Exception as error:  # the parsers raise whatever a malformed drawing leads them to
         reason = " ".join(str(error).split())[:80] or type(error).__name__
         raise FileFormatError(path, f"cannot be read as an SVG drawing ({reason})") from error

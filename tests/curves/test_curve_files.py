@@ -104,3 +104,61 @@ def test_an_svg_page_is_the_ground_seen_from_above(tmp_path):
     on_it = torch.tensor(weights @ np.array([[1, 2], [1, 6], [5, 6], [5, 12]]), dtype=torch.float64)
     assert float((curve.point(curve.nearest(on_it)) - on_it).norm()) < 1e-4
     assert curve.start_heading == pytest.approx(0, abs=0.05)
+
+
+# As Inkscape writes it: layers are groups with transforms, names are labels, clip paths and the like are in <defs>.
+INKSCAPE = """<?xml version="1.0" encoding="UTF-8" standalone="no"?>
+<svg width="210mm" height="297mm" viewBox="0 0 210 297" version="1.1" id="svg5" inkscape:version="1.2.2"
+   xmlns:inkscape="http://www.inkscape.org/namespaces/inkscape" xmlns="http://www.w3.org/2000/svg"
+   xmlns:sodipodi="http://sodipodi.sourceforge.net/DTD/sodipodi-0.dtd">
+  <sodipodi:namedview id="namedview7" pagecolor="#ffffff" inkscape:document-units="mm" />
+  <defs id="defs2"><clipPath id="clip9"><path id="path9" d="M 0,0 H 9" /></clipPath></defs>
+  <g inkscape:label="Layer 1" inkscape:groupmode="layer" id="layer1" transform="translate(10,20)">
+    <path style="fill:none;stroke:#000000" d="m 0,0 c 0,100 100,100 100,200" id="path234" inkscape:label="walk" />
+    <g id="g12" transform="scale(2)"><path d="M 0,0 V 100" id="path345" inkscape:label="2"/></g>
+  </g>
+  <g inkscape:groupmode="layer" id="layer2" transform="rotate(90)"><path d="m 100,0 h 300" id="run" /></g>
+</svg>"""
+
+
+@pytest.mark.parametrize(
+    ("name", "ends"),
+    [
+        ("walk", [[0.1, 0.2], [1.1, 2.2]]),
+        ("path234", [[0.1, 0.2], [1.1, 2.2]]),
+        ("1", [[0.1, 0.2], [1.1, 2.2]]),
+        ("2", [[0.1, 0.2], [0.1, 2.2]]),  # a label before a number
+        ("run", [[0, 1], [0, 4]]),
+        ("3", [[0, 1], [0, 4]]),
+    ],
+)
+def test_one_path_of_an_inkscape_drawing_is_named_by_id_label_or_number(tmp_path, name, ends):
+    write(tmp_path, "drawing.svg", INKSCAPE)
+    curve = curves.read(f"drawing.svg#{name}", folder=tmp_path)
+    torch.testing.assert_close(curve.points[[0, -1]], torch.tensor(ends, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("", "holds paths that do not touch (2.24 m apart); join them, or add one of them to the file's name: "),
+        ("#4", "holds no path '4'; choose one: "),
+        ("#", "holds no path ''; choose one: "),
+        ("#path9", "holds no path 'path9'; choose one: "),
+    ],
+)
+def test_a_drawing_of_several_paths_names_what_to_choose_from(tmp_path, name, message):
+    path = write(tmp_path, "drawing.svg", INKSCAPE)
+    with pytest.raises(FileFormatError) as error:
+        curves.read(f"{path}{name}")
+    assert str(error.value) == f"{path}: {message}#path234 (walk), #path345 (2), #run"
+
+
+def test_paths_without_names_are_numbered_in_the_order_of_the_drawing(tmp_path):
+    layers = ("<path d='M0,0 H100'/>", "<path d=''/>", "<path d='M0,100 H200'/><path d='M9,9 H309 M0,0 H1'/>")
+    path = write(tmp_path, "three.svg", f"<svg>{''.join(f'<g>{paths}</g>' for paths in layers)}</svg>")
+    with pytest.raises(FileFormatError, match=r"name: #1, #2, #3$"):
+        curves.read(path)
+    assert [round(curves.read(f"{path}#{number}").length) for number in (1, 2)] == [1, 2]
+    with pytest.raises(FileFormatError, match=r"do not touch \(3\.09 m apart\); join them$"):
+        curves.read(f"{path}#3")

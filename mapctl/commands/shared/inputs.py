@@ -1,15 +1,13 @@
-"""Readers of what options name: curves, rigs and motions."""
+"""Readers of what options name: rigs and motions."""
 
-import os
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from controllers.common.character import Character
-from mapctl import curves, formats
+from mapctl import formats
 from mapctl.commands.shared.options import ReadOptions
-from mapctl.curves import Curve
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.formats.text import warn_once
@@ -38,13 +36,6 @@ def count_frames(seconds: float) -> int:
     if seconds * PRIOR_FPS > MAX_FRAMES:
         raise RequestError(f"seconds must be at most {MAX_FRAMES // PRIOR_FPS}, got {seconds:g}")
     return max(2, round(seconds * PRIOR_FPS))
-
-
-def read_curve(text: str, metres_per_unit: float | None) -> Curve:
-    """Read the curve of a CURVE option. A missing file is reported as such, not taken for a shape."""
-    if any(mark in text for mark in (os.sep, os.altsep) if mark) and not Path(text).exists():
-        raise RequestError(f"{text}: no such file")
-    return curves.read(text, metres_per_unit=metres_per_unit)
 
 
 def read_rig(text: str | None, options: ReadOptions) -> Rig | None:
