@@ -58,6 +58,22 @@ class ShotOptions:
     0.2."""
 
 
+@dataclass(frozen=True)
+class SceneFootstep:
+    """A footstep of an actor, as a report has it."""
+
+    __pydantic_config__ = STRICT
+
+    foot: Literal["left", "right"]
+    """Which foot."""
+    lift_seconds: Seconds0
+    """When it leaves the ground, seconds since the first frame."""
+    land_seconds: Seconds0
+    """When it lands."""
+    toe: tuple[Coordinate, Coordinate]
+    """Where its toe joint lands, x and z, metres."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Actor(ShotOptions):
     """One character of a scene."""
@@ -80,6 +96,8 @@ class Actor(ShotOptions):
     """Speed along the curve by time, pairs of seconds and m/s, zero allowed; instead of `speed`."""
     keys: tuple[ShotKey, ...] = ()
     """Keyframes along the walk, one [[actors.keys]] table each."""
+    footsteps: tuple[SceneFootstep, ...] = ()
+    """Footsteps, one [[actors.footsteps]] table each: those of a report, moved."""
     offset: tuple[Coordinate, Coordinate] | None = None
     """Position of the curve's origin, x and z, metres; the world's origin if not given."""
     turn_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
@@ -111,6 +129,9 @@ class Actor(ShotOptions):
         for name, value in (("start", self.start), ("end", self.end)):
             if value not in ("walk", "stand") and _parse_clip_frame(value) is None:
                 return f"{name}: expected walk, stand or CLIP:FRAME, got {value!r}"
+        for number, step in enumerate(self.footsteps):
+            if step.land_seconds <= step.lift_seconds:
+                return f"footsteps[{number}].land_seconds: a foot lands after it is lifted"
         for number, key in enumerate(self.keys):
             if key.fault is not None:
                 return f"keys[{number}].{key.fault}"
@@ -219,7 +240,8 @@ def transform_curve(actor: Actor, folder: Path) -> Curve:
 
 def _list_allowed_keys(key: Sequence[int | str]) -> str:
     known = {"actors": Actor, "camera": CameraSettings, "obstacles": SceneObstacle} if len(key) > 1 else {}
-    table = ShotKey if "keys" in key[1:-1] else known.get(str(key[0]), SceneDescription)
+    inner = {"keys": ShotKey, "footsteps": SceneFootstep}
+    table = next((inner[str(part)] for part in key[1:-1] if part in inner), known.get(str(key[0]), SceneDescription))
     return f"allowed: {', '.join(item.name for item in fields(table))}"
 
 

@@ -21,7 +21,7 @@ from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, FEET, LIMBS, TOES
 
 _PATH_CM, _PROGRESS_CM, _REACH_CM, _POSE_CM = 15.0, 50.0, 1.0, 0.1
-_FACING_DEG, _LOOK_DEG, _STILL_CM_S = 0.1, 15.0, 6.0
+_FACING_DEG, _LOOK_DEG, _STILL_CM_S, _FOOTHOLD_CM = 0.1, 15.0, 6.0, 5.0
 # Captured walks, runs and gestures stay within these (`mapctl measure FOLDER`, the column of the largest).
 _GLIDE_CM, _GLIDE_RUNNING_CM, _RUNNING = 4.0, 15.0, 2.0  # of a walk, and from this speed on, m/s
 _UNSUPPORTED, _DEPTH_CM, _ACCELERATION = 0.3, 1.0, 90.0  # seconds; of a toe; m/s^2 of any joint at PRIOR_FPS
@@ -98,6 +98,12 @@ def check_constraints(
         worst = float(measure_look_errors(motion, look).max())
         name = f"look at {round(look.seconds, 2):g} s"
         found.append(Constraint(name, "straight", worst, _LOOK_DEG, "degrees", seconds=_span(look)))
+    for step in (step for step in request.footsteps if step.land < motion.num_frames):
+        toe, side, at = CANONICAL.index(TOES[step.foot]), ("left", "right")[step.foot], step.land / PRIOR_FPS
+        miss = 100 * float((positions[step.land, toe, ::2] - positions.new_tensor(step.toe)).norm())
+        found.append(
+            Constraint(f"{side} foot at {at:.2f} s", "lands there", miss, _FOOTHOLD_CM, "cm", seconds=(at, at))
+        )
     if request.obstacles:
         clear = 100 * float(measure_clearance(request.obstacles, positions[..., ::2]).amin())
         found.append(Constraint("obstacles", "no joint within", clear, 0.0, "cm", at_least=True))

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from mapctl import contacts, kinematics, rotations
 from mapctl.curves import Curve
+from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.kinematics import inverse
 from mapctl.motion import Motion
@@ -23,6 +24,7 @@ from mapctl.numerics import gaussian
 from mapctl.numerics.easing import smootherstep
 from mapctl.numerics.intervals import true_intervals
 from mapctl.skeleton import CANONICAL, FEET, LIMBS, TOES, leg_length
+from mapctl.terms import Keyframe
 
 _LEGS = [LIMBS[name] for name in FEET]
 _SWING, _BOTH = 13, 4  # frames at PRIOR_FPS of a swing, and of double support before and after it
@@ -35,7 +37,7 @@ _NARROWEST = 0.08  # metres between the ankles, sideways: less is a foot that cr
 
 @dataclass(frozen=True)
 class Footstep:
-    """A swing of one foot to its next foothold."""
+    """A swing of one foot to its next foothold: planned, given, or found in a motion."""
 
     foot: int
     """0 is left, 1 is right."""
@@ -65,6 +67,23 @@ def find_footsteps(motion: Motion) -> list[Footstep]:
         if first > 0 and stop < motion.num_frames:
             found.append(Footstep(foot, first - 1, stop, toe=tuple(toes[stop, foot, ::2].tolist())))
     return sorted(found, key=lambda step: step.land)
+
+
+_HELD, _FOOTHOLD_SIGMA = 6, 0.02  # frames from a landing on, and metres, in which a walk has a toe on a given foothold
+
+
+def hold_footsteps(steps: Sequence[Footstep], first: int, frames: int, toe_height: float) -> Keyframe:
+    """Build the term of given footholds for frames of a shot from `first` on; toes rest at a height, metres."""
+    positions = torch.zeros(frames, CANONICAL.num_joints, 3, dtype=torch.float64)
+    wanted = torch.zeros(frames, CANONICAL.num_joints, dtype=torch.bool)
+    for step in steps:
+        held, toe = (
+            slice(max(0, step.land - first), max(0, step.land + _HELD - first)),
+            CANONICAL.index(TOES[step.foot]),
+        )
+        positions[held, toe] = positions.new_tensor([step.toe[0], toe_height, step.toe[1]])
+        wanted[held, toe] = True
+    return Keyframe(positions, wanted, _FOOTHOLD_SIGMA, name="footholds")
 
 
 def _ground_pose(pose: Motion) -> Float[Tensor, "3"]:
@@ -169,6 +188,17 @@ def plan_footsteps(displacement: Displacement, frames: int) -> list[Footstep]:
     return [replace(step, toe=tuple(toes[step.foot][number])) for number, step in enumerate(plan)]
 
 
+def take_given(steps: Sequence[Footstep], start: int) -> list[Footstep]:
+    """Return given steps as the plan of a displacement that begins at a frame; RequestError where a foot has none."""
+    if {step.foot for step in steps} != {0, 1}:
+        raise RequestError(f"the footsteps at {steps[0].lift / PRIOR_FPS:.2f} s lead to a stand and need both feet")
+    shares = [min(1.0, (number + 1) / (len(steps) - 1)) for number in range(len(steps))]
+    return [
+        replace(step, lift=step.lift - start, land=step.land - start, share=share)
+        for step, share in zip(sorted(steps, key=lambda step: step.land), shares, strict=True)
+    ]
+
+
 def _lay_steps(feet: Sequence[int], frames: int) -> list[Footstep]:
     count = len(feet)
     swing = (frames - 1) / (count + (count + 1) * _BOTH / _SWING)
@@ -204,8 +234,9 @@ _SMOOTH = 3.0  # frames (sigma) over which hips follow their support
 def take_steps(displacement: Displacement, plan: Sequence[Footstep], frames: int) -> Motion:
     """Pose a body that follows a plan: the first frame is the displacement's start, the last its stop.
 
-    Hips are over the mean of both feet, and somewhat to the one that stands; they are as high as before and after,
-    but lower where a leg would be stretched. Trunk and arms go from one pose to the other.
+    The last step of each foot leads to the stop's stance. Hips are over the mean of both feet, and somewhat to the one
+    that stands; they are as high as before and after, but lower where a leg would be stretched. Trunk and arms go from
+    one pose to the other.
     """
     start, stop = displacement.start, displacement.stop
     clock = torch.arange(frames, dtype=torch.float64)
@@ -214,6 +245,8 @@ def take_steps(displacement: Displacement, plan: Sequence[Footstep], frames: int
         steps, held, swings = [step for step in plan if step.foot == foot], 0.0, list[_Swing]()
         stands = displacement.toes_at(foot, torch.tensor([0.0, *(step.share for step in steps)], dtype=torch.float64))
         for step, position, turn in zip(steps, stands[0][1:], stands[1][1:], strict=True):
+            if step is not steps[-1]:
+                position = position.new_tensor([step.toe[0], float(position[1]), step.toe[1]])
             swings.append(_Swing(step, position, turn))
             share = share + 0.5 * (step.share - held) * smootherstep(step.swing_at(clock))
             lifted = torch.sin(math.pi * step.swing_at(clock).clamp(0, 1)).square()

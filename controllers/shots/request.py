@@ -12,6 +12,7 @@ from torch import Tensor
 
 from controllers.common.character import Character
 from controllers.common.initial_state import MotionStart, start_from_state
+from controllers.shots.footsteps import Footstep
 from mapctl import kinematics
 from mapctl.curves import Curve
 from mapctl.curves.obstacles import Obstacle
@@ -283,6 +284,8 @@ class ShotRequest:
     """Points to look at."""
     poses: tuple[PoseKey, ...] = ()
     """Poses, positions and headings of the hips."""
+    footsteps: tuple[Footstep, ...] = ()
+    """Footsteps, as the report of a shot has them, some of them moved: where feet land, and when."""
     obstacles: tuple[Obstacle, ...] = ()
     """Obstacles to walk around."""
     others: Others | None = None

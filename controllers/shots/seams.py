@@ -14,7 +14,7 @@ from torch import Tensor
 
 from controllers.common.map_refinement import estimate_rest_height
 from controllers.inbetweening.pipeline import InfillSettings, fill
-from controllers.shots.footsteps import Displacement, LastSteps, plan_footsteps, take_steps
+from controllers.shots.footsteps import Displacement, Footstep, LastSteps, plan_footsteps, take_given, take_steps
 from controllers.shots.request import Arrival, Lead
 from controllers.shots.trajectory import Span, Trajectory
 from controllers.shots.walk import Piece
@@ -152,14 +152,17 @@ class JoinedPieces:
         return motion
 
 
-def join_pieces(pieces: Sequence[Piece], trajectory: Trajectory, inbetweener: Inbetweener) -> JoinedPieces:
-    """Join pieces: two stands by footsteps, others by the transitions that cost least."""
+def join_pieces(
+    pieces: Sequence[Piece], trajectory: Trajectory, inbetweener: Inbetweener, footsteps: Sequence[Footstep] = ()
+) -> JoinedPieces:
+    """Join pieces: two stands by footsteps, planned where none are given there, others by the transitions that cost
+    least."""
     joined = pieces[0].motion
     missing = torch.zeros(joined.num_frames, dtype=torch.bool)
     earliest, first_steps, last_steps = 0, list[tuple[int, int]](), list[tuple[int, int]]()
     for before, after in pairwise(pieces):
         if before.span.what == after.span.what == "stand":
-            start, steps = _step_across(before, after, trajectory, earliest)
+            start, steps = _step_across(before, after, trajectory, earliest, footsteps)
             stop = start + steps.num_frames - 1
             joined = _insert(_join_across(joined, after.motion, stop), steps, start)
             earliest = stop
@@ -193,7 +196,9 @@ def _keep_comfortable(candidates: Sequence[Filling], *, stops: bool) -> list[Fil
     return [candidates[at] for at in order[:_TRIED_TRANSITIONS] if strains[at] <= strains[order[0]] + _NEARLY]
 
 
-def _step_across(before: Piece, after: Piece, trajectory: Trajectory, earliest: int) -> tuple[int, Motion]:
+def _step_across(
+    before: Piece, after: Piece, trajectory: Trajectory, earliest: int, footsteps: Sequence[Footstep]
+) -> tuple[int, Motion]:
     """Step from one stand to the next along a trajectory; return the first frame and the motion. Where speeds give too
     little time, the stands do."""
     frames = after.motion.num_frames
@@ -205,7 +210,8 @@ def _step_across(before: Piece, after: Piece, trajectory: Trajectory, earliest: 
     short = displacement.count_frames() - (reached - left + 1)
     start = max(min(left, first), left - max(0, short) // 2)
     stop = min(max(reached, latest), start + max(reached - start, displacement.count_frames() - 1))
-    plan = plan_footsteps(displacement, stop - start + 1)
+    given = [step for step in footsteps if start <= step.lift and step.land <= stop]
+    plan = take_given(given, start) if given else plan_footsteps(displacement, stop - start + 1)
     return start, take_steps(displacement, plan, stop - start + 1)
 
 

@@ -123,7 +123,7 @@ def solve_shot(
     )
     motion, reaches, met = pieces[0].motion, request.reaches, ()
     if inbetweener is not None:
-        joined = join_pieces(pieces, trajectory, inbetweener)
+        joined = join_pieces(pieces, trajectory, inbetweener, request.footsteps)
         motion = _finish_ends(joined, request, trajectory, inbetweener)
         motion, reaches, met = _meet_keys(motion, request, trajectory, inbetweener)
     notes = [trajectory.note] if trajectory.note else []

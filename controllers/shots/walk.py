@@ -11,6 +11,7 @@ from torch import Tensor
 
 from controllers.common.character import Character
 from controllers.common.initial_state import MotionStart, select_initial_state
+from controllers.shots.footsteps import hold_footsteps
 from controllers.shots.request import ShotRequest
 from controllers.shots.trajectory import Span, Trajectory, cut_curve, lay_stands, lay_timeline
 from mapctl.curves import Curve
@@ -176,6 +177,8 @@ def walk_spans(
 
     def shot_terms(begin: int, count: int) -> Sequence[Term]:
         found = [*terms_of(begin, count)]
+        if request.footsteps:
+            found.append(hold_footsteps(request.footsteps, begin, count, character.toe_rest_height))
         if request.obstacles:
             found.append(KeepClear(request.obstacles))
         if request.others is not None:

@@ -9,11 +9,21 @@ import torch
 
 import priors
 from controllers.shots.constraints import check_constraints
-from controllers.shots.footsteps import Displacement, LastSteps, plan_footsteps, take_steps
+from controllers.shots.footsteps import (
+    Displacement,
+    Footstep,
+    LastSteps,
+    find_footsteps,
+    hold_footsteps,
+    plan_footsteps,
+    take_given,
+    take_steps,
+)
 from controllers.shots.reaching import build_rest_pose
 from controllers.shots.request import ShotRequest
 from controllers.shots.trajectory import plan_trajectory
 from mapctl import curves
+from mapctl.errors import RequestError
 from mapctl.kinematics.moving import move_to, rotate_about_vertical
 from mapctl.metrics.body import measure_glide
 from mapctl.skeleton import CANONICAL, FEET, TOES
@@ -93,6 +103,29 @@ def test_last_steps_land_on_the_footholds_of_the_stand(rest):
     torch.testing.assert_close(toes[-1], steps.joint_positions()[-1, FOUR[:2]])
     assert [step.foot for step in last.plan()] == [plan[-2].foot, plan[-1].foot]
     assert measure_glide(motion.joint_positions()[:, FOUR], 30.0) == 0.0
+
+
+def test_given_footsteps_are_taken_and_found_again(rest):
+    displacement, frames = displace(rest, 0.0, 1.2, 0.0), 73
+    plan = plan_footsteps(displacement, frames)
+    x, z = plan[1].toe
+    given = [replace(step, lift=step.lift + 20, land=step.land + 20) for step in plan]
+    given[1] = replace(given[1], toe=(x + 0.06, z - 0.05))
+    motion = take_steps(displacement, take_given(given, 20), frames)
+    toes = motion.joint_positions()[:, FOUR[:2]]
+    assert toes[plan[1].land, plan[1].foot, ::2].tolist() == pytest.approx([x + 0.06, z - 0.05], abs=1e-6)
+    torch.testing.assert_close(toes[-1], displacement.stop.joint_positions()[0, FOUR[:2]])
+    found = find_footsteps(motion)
+    assert [step.foot for step in found] == [step.foot for step in plan]
+    assert max(math.dist(one.toe, other.toe) for one, other in zip(found, take_given(given, 20), strict=True)) < 0.03
+    with pytest.raises(RequestError, match="need both feet"):
+        take_given(given[:1], 20)
+
+
+def test_walks_are_held_to_footholds_from_the_landing_on():
+    term = hold_footsteps([Footstep(1, 8, 14, toe=(0.3, 2.0))], 10, 12, 0.04)
+    assert term.wanted.nonzero().tolist() == [[frame, CANONICAL.index(TOES[1])] for frame in range(4, 10)]
+    assert term.positions[4, CANONICAL.index(TOES[1])].tolist() == [0.3, 0.04, 2.0]
 
 
 def test_a_displacement_without_steps_does_not_hold(rest):

@@ -13,6 +13,7 @@ from torch import Tensor
 
 import priors
 from controllers.common.character import Character
+from controllers.shots.footsteps import Footstep
 from controllers.shots.reaching import build_rest_pose
 from controllers.shots.request import Arrival, Lead, Look, Others, PoseKey, Reach, ShotRequest
 from controllers.shots.shot import ShotSolution, solve_shot
@@ -133,6 +134,15 @@ def plan_shot(
         reaches=tuple(reaches),
         looks=tuple(looks),
         poses=tuple(poses),
+        footsteps=tuple(
+            Footstep(
+                ("left", "right").index(step.foot),
+                round(step.lift_seconds * PRIOR_FPS),
+                round(step.land_seconds * PRIOR_FPS),
+                toe=step.toe,
+            )
+            for step in actor.footsteps
+        ),
         obstacles=tuple(obstacles),
     )
     labels = [f"{group}={value}" for group, value in (("gait", actor.gait), ("style", actor.style)) if value]
