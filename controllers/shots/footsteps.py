@@ -364,6 +364,9 @@ def bend_legs(motion: Motion, ankles: Float[Tensor, "frames 2 3"], turns: Float[
     positions, world, quats = motion.joint_positions(), motion.joint_rotations(), motion.local_quat_xyzw.clone()
     for foot, limb in enumerate(_LEGS):
         aim, offsets = ankles[:, foot] - positions[:, limb.upper], motion.skeleton.offsets.to(positions)
+        bend = rotations.to_rotation_vector(quats[:, limb.lower])
+        bend[:, 0] = bend[:, 0].clamp_min(0)  # a leg that is straight bends forward again, not backward
+        quats[:, limb.lower] = rotations.from_rotation_vector(bend)
         turn, bent = inverse.reach(limb, world[:, limb.upper], quats[:, limb.lower], aim, offsets)
         quats[:, limb.upper] = rotations.multiply(rotations.inverse(world[:, 0]), turn)
         quats[:, limb.lower] = bent

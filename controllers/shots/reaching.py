@@ -176,6 +176,7 @@ _STEP_ASIDE = 1.2  # metres between the trajectory and a body that leans and lea
 _BEND_LENGTH, _BEND_STEP = 1.2, 0.05  # metres of arc over which it bends toward a reach, and between its offsets
 _LEAST_BEND, _USUAL_BEND, _MOST_BEND = 0.1, 0.5, 0.9
 """Metres aside: less is left to the walk, more takes longer, more still is another trajectory."""
+_WALKING = 0.3  # m/s of the trajectory, from which on it is bent toward a position of the hips
 _BEND_SHARES = (1.0, 0.7, 0.4)  # of a bend that are tried, where an obstacle blocks all of it
 _STRAIGHT_AHEAD = 0.6  # of a limb's length that it reaches down beside whatever it reaches aside
 _LEAST_CROUCH, _MOST_CROUCH, _POSED_FRAMES = 0.03, 0.3, 15  # metres down; frames beside a pose that is kept
@@ -203,26 +204,33 @@ def check_reaches(reaches: Sequence[Reach], trajectory: Trajectory, rest: Motion
                 )
 
 
-def bend_toward_reaches(trajectory: Trajectory, request: ShotRequest, rest: Motion) -> Trajectory:
-    """Return a trajectory bent toward what is reached for where that is too far aside for an arm and a lean."""
+def bend_toward_keys(trajectory: Trajectory, request: ShotRequest, rest: Motion) -> Trajectory:
+    """Return a trajectory bent toward what is reached for where that is too far aside for an arm and a lean, and toward
+    positions of the hips that are passed in a walk."""
     length = trajectory.curve.length
-    if not request.reaches or (trajectory.curve.closed and float(trajectory.arcs[-1]) > length):
+    if trajectory.curve.closed and float(trajectory.arcs[-1]) > length:
         return trajectory
-    along = torch.linspace(0, length, max(2, round(length / _BEND_STEP) + 1), dtype=torch.float64)
-    offsets, met = torch.zeros_like(along), []
+    asides = []
     for reach in request.reaches:
         arc = trajectory.arcs[min(round(reach.seconds * PRIOR_FPS), len(trajectory.arcs) - 1)]
-        for name, position in reach.positions.items():
-            aside = _find_lacking_aside(trajectory, arc, rest, name, position)
-            if abs(aside) > _LEAST_BEND:
-                met.append(float(arc))
-                reach_length = _BEND_LENGTH * max(1.0, abs(aside) / _USUAL_BEND)
-                offsets += aside * smootherstep(1 - (along - arc).abs() / reach_length)
+        asides += [(arc, _find_lacking_aside(trajectory, arc, rest, *target)) for target in reach.positions.items()]
+    for key in request.poses:
+        frame = min(round(key.seconds * PRIOR_FPS), len(trajectory.arcs) - 1)
+        if key.place is not None and trajectory.speeds[frame] > _WALKING:
+            arc = trajectory.arcs[frame]
+            ground = trajectory.arcs.new_tensor(key.place) - trajectory.curve.ground_point(arc)
+            asides.append((arc, float(ground @ trajectory.curve.left(arc))))
+    asides = [(arc, aside) for arc, aside in asides if abs(aside) > _LEAST_BEND]
+    along = torch.linspace(0, length, max(2, round(length / _BEND_STEP) + 1), dtype=torch.float64)
+    offsets = torch.zeros_like(along)
+    for arc, aside in asides:
+        reach_length = _BEND_LENGTH * max(1.0, abs(aside) / _USUAL_BEND)
+        offsets += aside * smootherstep(1 - (along - arc).abs() / reach_length)
     offsets = offsets.clamp(-_STEP_ASIDE, _STEP_ASIDE) * smootherstep(along / (0.5 * _BEND_LENGTH))
     if bool((offsets.abs() < 1e-3).all()):
         return trajectory
     for share in _BEND_SHARES:  # a closed curve is walked once at most here, and bent it is an open one
-        bent = bend_trajectory(trajectory, share * offsets, met)
+        bent = bend_trajectory(trajectory, share * offsets, [float(arc) for arc, _ in asides])
         clear = measure_clearance(request.obstacles, bent.curve.ground_point(bent.arcs))
         if float(clear.amin()) >= _BODY:
             return bent

@@ -20,7 +20,7 @@ from controllers.shots.reaching import (
     MetPose,
     ReachTargets,
     as_reaches,
-    bend_toward_reaches,
+    bend_toward_keys,
     build_rest_pose,
     check_reaches,
     go_down,
@@ -105,7 +105,7 @@ def solve_shot(
     poses = tuple(key for key in request.poses if not key.joints)
     request = replace(request, reaches=(*request.reaches, *limb_keys), poses=poses)
     check_reaches(request.reaches, trajectory, rest)
-    trajectory = bend_toward_reaches(trajectory, request, rest)
+    trajectory = bend_toward_keys(trajectory, request, rest)
     if slows_in_corners(request, trajectory.curve):
         settings = replace(settings, footing=replace(settings.footing, heels=None))
     reach = ReachTargets.of(request.reaches, len(trajectory.speeds) + (OVERLAP if request.loop else 0))

@@ -13,6 +13,7 @@ from controllers.shots.footsteps import (
     Displacement,
     Footstep,
     LastSteps,
+    bend_legs,
     find_footsteps,
     hold_footsteps,
     plan_footsteps,
@@ -22,7 +23,7 @@ from controllers.shots.footsteps import (
 from controllers.shots.reaching import build_rest_pose
 from controllers.shots.request import ShotRequest
 from controllers.shots.trajectory import plan_trajectory
-from mapctl import curves
+from mapctl import curves, rotations
 from mapctl.errors import RequestError
 from mapctl.kinematics.moving import move_to, rotate_about_vertical
 from mapctl.metrics.body import measure_glide
@@ -120,6 +121,16 @@ def test_given_footsteps_are_taken_and_found_again(rest):
     assert max(math.dist(one.toe, other.toe) for one, other in zip(found, take_given(given, 20), strict=True)) < 0.03
     with pytest.raises(RequestError, match="need both feet"):
         take_given(given[:1], 20)
+
+
+def test_a_leg_that_was_bent_backward_bends_forward(rest):
+    quats, knee = rest.local_quat_xyzw.clone(), CANONICAL.index("leftLowerLeg")
+    quats[:, knee] = rotations.from_rotation_vector(torch.tensor([[-0.1, 0.0, 0.0]], dtype=torch.float64))
+    feet = list(CANONICAL.indices(FEET))
+    ankles, turns = rest.joint_positions()[:, feet], rest.joint_rotations()[:, feet]
+    bent = bend_legs(replace(rest, local_quat_xyzw=quats), ankles, turns)
+    torch.testing.assert_close(bent.joint_positions()[:, feet], ankles)
+    assert float(rotations.to_rotation_vector(bent.local_quat_xyzw[:, knee])[0, 0]) > 0.1
 
 
 def test_walks_are_held_to_footholds_from_the_landing_on():
