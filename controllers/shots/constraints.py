@@ -24,7 +24,8 @@ _PATH_CM, _PROGRESS_CM, _REACH_CM, _POSE_CM = 15.0, 50.0, 1.0, 0.1
 _FACING_DEG, _LOOK_DEG, _STILL_CM_S, _FOOTHOLD_CM = 0.1, 15.0, 6.0, 5.0
 # Captured walks, runs and gestures stay within these (`mapctl measure FOLDER`, the column of the largest).
 _GLIDE_CM, _GLIDE_RUNNING_CM, _RUNNING = 4.0, 15.0, 2.0  # of a walk, and from this speed on, m/s
-_UNSUPPORTED, _DEPTH_CM, _ACCELERATION = 0.3, 1.0, 90.0  # seconds; of a toe; m/s^2 of any joint at PRIOR_FPS
+_SLIDE_CM, _DEPTH_CM, _UNSUPPORTED = 5.0, 1.0, 0.3  # of a planted toe; of any toe; seconds
+_ACCELERATION = 90.0  # m/s^2 of any joint at PRIOR_FPS
 _SEAM_RATIO = 1.2  # of a loop's largest step from one frame to the next
 _NEAR_KEY_SECONDS = 1.0
 _ASIDE = 0.05  # metres beside the curve, from which on a trajectory is bent toward a reach
@@ -131,6 +132,7 @@ def _check_motion(positions: Float[Tensor, "frames joints 3"]) -> list[Constrain
     at = (int(measure_accelerations(positions, PRIOR_FPS).argmax()) + 1) / PRIOR_FPS
     return [
         Constraint("feet", "a step for every displacement", worst["glide_cm"], glide, "cm"),
+        Constraint("soles", "rest while they stand", worst["slide_max_cm"], _SLIDE_CM, "cm"),
         Constraint("support", "a foot on the ground, or flight", worst["unsupported_max_s"], _UNSUPPORTED, "s"),
         Constraint("ground", "no toe below", worst["depth_max_cm"], _DEPTH_CM, "cm"),
         Constraint("acceleration", f"at {at:.2f} s", worst["acceleration_max_m_s2"], _ACCELERATION, "m/s^2"),

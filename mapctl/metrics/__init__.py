@@ -53,10 +53,10 @@ def measure(
 
     Always: `skate_cm_s`, `skate_ratio`, `contact_speed_cm_s`, `planted_share`, `penetration_cm`, `float_cm`,
     `heel_contact_speed_cm_s`, `heel_planted_share`, `heel_slide_max_cm` and `foot_turn_deg_s` (canonical joints alone
-    show where heels are, else NaN), the worst frames `glide_cm`, `unsupported_max_s`, `depth_max_cm` and
-    `acceleration_max_m_s2` (see `body.measure_worst`), `jitter_m_s3`, `speed_m_s`, `turned_deg`, `turn_rate_deg_s`,
-    `hips_height_m`, `pose_variation_cm`, and `sway_cm`: from the straight line between the walk's ends, or from the
-    curve. With a curve
+    show where heels are, else NaN), the worst frames `glide_cm`, `slide_max_cm`, `unsupported_max_s`, `depth_max_cm`
+    and `acceleration_max_m_s2` (see `body.measure_worst`), `jitter_m_s3`, `speed_m_s`, `turned_deg`,
+    `turn_rate_deg_s`, `hips_height_m`, `pose_variation_cm`, and `sway_cm`: from the straight line between the walk's
+    ends, or from the curve. With a curve
     also `path_error_{mean,p95,max}_cm`, `path_error_low_passed_{mean,p95,max}_cm` and `travelled_m`; with the wanted
     `speed` (m/s) `wanted_m` and `progress_ratio` too. `joint` names the one that follows the curve, else the hips do.
     MapctlError for rigs whose hips, legs or feet are not found, unknown joints and motions of one frame.

@@ -6,6 +6,7 @@ means, which hide them: a hand that jumps by half a metre in one frame of two hu
 stand still.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import NamedTuple
@@ -111,11 +112,15 @@ _UNIT = 100.0  # cm
 def measure_worst(
     positions: Float[Tensor, "frames joints 3"], hips: int, toes: Sequence[int], ankles: Sequence[int], fps: float
 ) -> dict[str, float]:
-    """Measure the worst frames of a motion, which means hide: travel without a step, time without support, depth of a
-    toe under its floor, and the acceleration of any joint (0 for fewer than three frames)."""
+    """Measure the worst frames of a motion, which means hide: travel without a step, slide of a planted toe, time
+    without support, depth of a toe under its floor, and the acceleration of any joint (0 for fewer than three frames).
+    """
     feet, depth = positions[:, [*toes, *ankles]], contacts.estimate_floor_heights(positions[:, toes])
+    ground, planted = positions[:, toes][..., ::2], contacts.detect_contacts(positions[:, toes], fps)
+    slides = [ground[start:stop, foot] - ground[start, foot] for foot, start, stop in true_intervals(planted)]
     return {
         "glide_cm": _UNIT * measure_glide(feet, fps),
+        "slide_max_cm": _UNIT * max((float(slide.norm(dim=-1).max()) for slide in slides), default=math.nan),
         "unsupported_max_s": measure_longest_unsupported(positions[:, toes], positions[:, hips], fps),
         "depth_max_cm": _UNIT * float((depth - positions[:, toes, 1]).max()),
         "acceleration_max_m_s2": float(measure_accelerations(positions, fps).amax()) if len(positions) > 2 else 0.0,

@@ -43,7 +43,7 @@ def test_it_follows_a_curve():
     start, end = done.motion.root_position[[0, -1], 2].tolist()
     assert end - start == pytest.approx(29 * 1.2 / 30, abs=0.15)
     # Its legs know no steps.
-    assert {note.split(" (")[0] for note in done.status.notes} <= {"feet", "support"}
+    assert {note.split(" (")[0] for note in done.status.notes} <= {"feet", "soles", "support"}
 
 
 def test_it_is_steered():
