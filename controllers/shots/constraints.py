@@ -13,6 +13,7 @@ from torch import Tensor
 from controllers.shots.reaching import STRETCHED_SHARE, MetPose, ReachTargets, measure_look_errors, measure_pose_error
 from controllers.shots.request import Look, PoseKey, Reach, ShotRequest
 from controllers.shots.trajectory import Trajectory
+from controllers.shots.walk import MOST_ACCELERATION
 from mapctl.curves.obstacles import measure_clearance
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.effector_targets import compute_target_errors
@@ -25,7 +26,6 @@ _FACING_DEG, _LOOK_DEG, _STILL_CM_S, _FOOTHOLD_CM = 0.1, 15.0, 6.0, 5.0
 # Captured walks, runs and gestures stay within these (`mapctl measure FOLDER`, the column of the largest).
 _GLIDE_CM, _GLIDE_RUNNING_CM, _RUNNING = 4.0, 15.0, 2.0  # of a walk, and from this speed on, m/s
 _SLIDE_CM, _DEPTH_CM, _UNSUPPORTED = 5.0, 1.0, 0.3  # of a planted toe; of any toe; seconds
-_ACCELERATION = 90.0  # m/s^2 of any joint at PRIOR_FPS
 _SEAM_RATIO = 1.2  # of a loop's largest step from one frame to the next
 _NEAR_KEY_SECONDS = 1.0
 _ASIDE = 0.05  # metres beside the curve, from which on a trajectory is bent toward a reach
@@ -135,7 +135,7 @@ def _check_motion(positions: Float[Tensor, "frames joints 3"]) -> list[Constrain
         Constraint("soles", "rest while they stand", worst["slide_max_cm"], _SLIDE_CM, "cm"),
         Constraint("support", "a foot on the ground, or flight", worst["unsupported_max_s"], _UNSUPPORTED, "s"),
         Constraint("ground", "no toe below", worst["depth_max_cm"], _DEPTH_CM, "cm"),
-        Constraint("acceleration", f"at {at:.2f} s", worst["acceleration_max_m_s2"], _ACCELERATION, "m/s^2"),
+        Constraint("acceleration", f"at {at:.2f} s", worst["acceleration_max_m_s2"], MOST_ACCELERATION, "m/s^2"),
     ]
 
 

@@ -31,6 +31,8 @@ _SWING, _BOTH = 13, 4  # frames at PRIOR_FPS of a swing, and of double support b
 _STEP, _TURN = 0.7, math.radians(75.0)  # of legs' length, and radians, that a foot is put ahead of the other at most
 _SLOWEST = 45  # frames of a step at most: where there is more time, there are more steps
 _TRACK_STEP = 0.05  # metres between the points of a track
+CORNER = 0.04
+"""Metres beside a corner of a curve where its directions are."""
 _MOVED, _TURNED = 0.02, math.radians(4.0)  # metres and radians from which on a foot is lifted
 _NARROWEST = 0.08  # metres between the ankles, sideways: less is a foot that crosses the other
 
@@ -118,7 +120,8 @@ class Displacement:
         """Displace a body along a curve between two arcs, metres."""
         points = max(2, math.ceil(float(arcs[1] - arcs[0]) / _TRACK_STEP) + 1)
         at = torch.lerp(arcs[0], arcs[1], torch.linspace(0, 1, points, dtype=arcs.dtype))
-        heading = rotations.unwrap_angle(curve.heading(at))
+        corner = min(CORNER, float(arcs[1] - arcs[0]) / 2)  # it faces along the curve after one, and before the next
+        heading = rotations.unwrap_angle(curve.heading(at.clamp(arcs[0] + corner, arcs[1] - corner)))
         return Displacement.between(start, stop, torch.cat([curve.ground_point(at), heading[:, None]], dim=-1))
 
     @property

@@ -1,4 +1,4 @@
-"""In-betweening within a walked motion: transitions between its spans, seams of loops and clips, jumps.
+"""In-betweening within a walked motion: transitions between its spans, seams of loops and clips.
 
 Where a transition lies is a choice with several basins: a few frames earlier another foot is in the air. A grid is
 tried, and the proposal with the least visible artefacts is taken.
@@ -19,7 +19,6 @@ from controllers.shots.request import Arrival, Lead
 from controllers.shots.trajectory import Span, Trajectory
 from controllers.shots.walk import Piece
 from mapctl import contacts
-from mapctl.features import PRIOR_FPS
 from mapctl.metrics import body
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
@@ -305,37 +304,3 @@ def close_loop(motion: Motion, frames: int, inbetweener: Inbetweener) -> Motion:
         )
         tried += [Filling.of_frames(joined, seam - width, seam + width) for width in (3, 6, 10)]
     return _fill_best(tried, inbetweener)
-
-
-_JUMP_SPEED = 3.0  # m/s about the hips
-_JUMP_RATIO = 1.6  # of the speed two frames earlier and later: limbs that swing fast do so for longer
-_AROUND = 6  # frames before and after a jump
-
-
-def repair_jumps(motion: Motion, inbetweener: Inbetweener, *, past: Motion | None = None) -> Motion:
-    """Generate frames around jumps anew, where that is calmer; the first and the last frame stay. `past` are the frames
-    before the first, where there are any."""
-    if past is not None:
-        whole = repair_jumps(past.join(motion), inbetweener)
-        return _join_across(motion, whole.slice(past.num_frames, whole.num_frames), 1)
-    missing = torch.zeros(motion.num_frames, dtype=torch.bool)
-    for frame in find_jumps(motion).nonzero()[:, 0].tolist():
-        missing[max(1, frame - _AROUND) : frame + _AROUND + 2] = True
-    missing[-1] = False
-    if not bool(missing.any()):
-        return motion
-    calmer = fill_frames(motion, missing, inbetweener)
-    peaks = [
-        torch.diff(each.joint_positions()[:, _EFFECTORS], n=2, dim=0).norm(dim=-1).max() for each in (calmer, motion)
-    ]
-    return calmer if float(peaks[0]) < float(peaks[1]) else motion
-
-
-def find_jumps(motion: Motion) -> Bool[Tensor, " steps"]:
-    """Find the steps from one frame to the next in which a hand or a toe moves much faster than shortly before and
-    after."""
-    positions = motion.joint_positions()
-    speed = torch.diff(positions[:, _EFFECTORS] - positions[:, :1], dim=0).norm(dim=-1) * PRIOR_FPS
-    beside = torch.full_like(speed, torch.inf)  # at the ends nothing shows what was before, or comes after
-    beside[2:-2] = torch.maximum(speed[:-4], speed[4:])
-    return ((speed > _JUMP_SPEED) & (speed > _JUMP_RATIO * beside)).any(dim=1)

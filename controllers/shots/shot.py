@@ -31,16 +31,7 @@ from controllers.shots.reaching import (
     turn_heads,
 )
 from controllers.shots.request import Reach, ShotRequest
-from controllers.shots.seams import (
-    OVERLAP,
-    JoinedPieces,
-    arrive,
-    close_loop,
-    fill_frames,
-    go_on,
-    join_pieces,
-    repair_jumps,
-)
+from controllers.shots.seams import OVERLAP, JoinedPieces, arrive, close_loop, fill_frames, go_on, join_pieces
 from controllers.shots.trajectory import Trajectory, plan_trajectory
 from controllers.shots.walk import FollowSettings, check_path, check_tracking, slows_in_corners, walk_spans
 from mapctl.curves import Curve
@@ -152,12 +143,12 @@ def _finish_ends(
     joined: JoinedPieces, request: ShotRequest, trajectory: Trajectory, inbetweener: Inbetweener
 ) -> Motion:
     """Generate the missing frames, and let the motion continue from, end in, or come round to what is requested."""
-    motion, missing, past = joined.motion, joined.missing, None
+    motion, missing = joined.motion, joined.missing
     if request.lead is not None:
-        motion, past = go_on(motion, missing, request.lead, inbetweener), request.lead.past
+        motion = go_on(motion, missing, request.lead, inbetweener)
     elif bool(missing.any()):
         motion = fill_frames(motion, missing, inbetweener)
-    motion = repair_jumps(joined.settle(motion), inbetweener, past=past)
+    motion = joined.settle(motion)
     if request.loop:
         motion = close_loop(motion, len(trajectory.speeds), inbetweener)
     if request.arrival is not None:

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-from controllers.shots.footsteps import Displacement
+from controllers.shots.footsteps import CORNER, Displacement
 from controllers.shots.request import Others, PoseKey, ShotRequest
 from mapctl import curves, kinematics, rotations
 from mapctl.curves import Curve
@@ -145,7 +145,7 @@ def lay_stands(spans: Sequence[Span], trajectory: "Trajectory", request: ShotReq
             found.append(span)
             continue
         arc = trajectory.arcs[span.start]
-        before, after = (trajectory.curve.heading(arc + side * _CORNER) for side in (-1.0, 1.0))
+        before, after = (trajectory.curve.heading(arc + side * CORNER) for side in (-1.0, 1.0))
         inside = span.start > 0 and span.stop < frames
         if inside and abs(float(rotations.wrap_angle(after - before))) >= _REVERSAL:
             held = max(1, (span.stop - span.start - round(_TURN_SECONDS * PRIOR_FPS)) // 2)
@@ -209,6 +209,11 @@ def lay_timeline(speeds: Float[Tensor, " frames"], *, slowest: float) -> list[Sp
         if stop > start:
             spans.append(Span("stand", start, stop))
         before = stop
+    # Where there is too little for a walk, it is stepped: from a stand, or to one.
+    if spans[0].start > 0:
+        spans.insert(0, Span("stand", 0, 1))
+    if spans[-1].stop < frames:
+        spans.append(Span("stand", frames - 1, frames))
     return spans
 
 
@@ -270,7 +275,7 @@ _BODY_MARGIN = 0.35  # metres from the hips to an obstacle's edge: arms swing th
 APART_MARGIN = 0.15
 """Metres beyond the distance to others by which trajectories keep apart: hips sway, and are early or late."""
 _TURN_SECONDS, _TURN_HELD = 1.8, 0.2  # of steps where a curve reverses, and of standing before them and after
-_CORNER, _REVERSAL = 0.04, math.radians(60.0)  # metres beside a corner where its directions are, and their difference
+_REVERSAL = math.radians(60.0)  # between the directions on both sides of a corner
 _FINE_STEP = 0.02  # metres of arc
 _CATCH_UP = 3.0  # metres of arc over which a longer trajectory is caught up
 _MOST_FRAMES = 108_000

@@ -19,6 +19,7 @@ from mapctl.curves.tracking import track_arcs
 from mapctl.errors import MapctlError
 from mapctl.features import LAYOUT, PRIOR_FPS
 from mapctl.intent.path import find_reversals, walk_at_ease
+from mapctl.metrics.body import measure_accelerations
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
 from mapctl.pose import decode
@@ -27,7 +28,6 @@ from mapctl.problem.solution import Outcome
 from mapctl.problem.window_solvers import LatentNoiseSolver, SingleWindowSolver
 from mapctl.protocols import DataLimits, Density
 from mapctl.runtime.stepwise import Progress
-from mapctl.skeleton import CANONICAL, TOES
 from mapctl.terms import FootContact, KeepApart, KeepClear, LandingSigmas, LatentPrior, Path, Term
 
 
@@ -138,9 +138,10 @@ def build_follow_terms(
 
 TAIL = 14
 """Frames that a walk goes on for a later last step."""
-_TOES = list(CANONICAL.indices(TOES))
 _TRIES = 5  # walks of a span, of which the first that passes is taken, or the best
-_MOST_OFF, _MOST_BENT = 0.3, 70.0  # metres from where hips of the prior's size were to be; m/s^2 of a toe
+_MOST_OFF = 0.3  # metres from where hips of the prior's size were to be
+MOST_ACCELERATION = 90.0
+"""m/s^2 of any joint at PRIOR_FPS: captured walks, runs and gestures stay below (`mapctl measure FOLDER`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,11 +247,10 @@ def slows_in_corners(request: ShotRequest, curve: Curve) -> bool:
 
 def _measure_fault(motion: Motion, wanted: Float[Tensor, "frames 2"]) -> float:
     """Return the larger of the hips' distance from where they were to be at that time and the largest acceleration of a
-    toe, as shares of what passes."""
+    joint, as shares of what passes."""
     off = float((motion.root_position[:, ::2] - wanted.to(motion.root_position)).norm(dim=-1).max())
-    toes = motion.joint_positions()[:, _TOES]
-    bent = float(torch.diff(toes, n=2, dim=0).norm(dim=-1).max()) * PRIOR_FPS**2 if len(toes) > 2 else 0.0
-    return max(off / _MOST_OFF, bent / _MOST_BENT)
+    accelerations = measure_accelerations(motion.joint_positions(), PRIOR_FPS)
+    return max(off / _MOST_OFF, float(accelerations.max()) / MOST_ACCELERATION if len(accelerations) else 0.0)
 
 
 def _extend(arcs: Float[Tensor, " frames"], more: int) -> Float[Tensor, " ahead"]:

@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 import torch
 from helpers import generator, walk
-from linear_inbetweener import LinearInbetweener
 
 import controllers
 import priors
 from controllers.common.character import Character
 from controllers.shots.reaching import build_rest_pose, measure_look_errors, turn_heads
 from controllers.shots.request import Lead, Look, Others, Reach, ShotRequest
-from controllers.shots.seams import compute_artefact_cost, find_jumps, repair_jumps
+from controllers.shots.seams import compute_artefact_cost
 from controllers.shots.shot import solve_shot
 from controllers.shots.trajectory import StandingEnds, Trajectory, lay_timeline, plan_speeds, plan_trajectory
 from mapctl import curves, kinematics, rotations
@@ -26,7 +25,7 @@ from mapctl.errors import RequestError
 from mapctl.intent.path import SpeedProfile, TimedSpeed
 from mapctl.metrics import body
 from mapctl.metrics.body import measure_peaks
-from mapctl.skeleton import CANONICAL, LIMBS, TOE_REST_HEIGHT, TOES
+from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, TOES
 from scenes.scene_file import Actor
 
 LINE = curves.line(length=3)
@@ -289,30 +288,6 @@ def test_where_there_is_room_for_two_the_first_one_makes_none():
     plans = meet(3.5)
     first, second = let_others_pass(plans, APART)
     assert (first, second) == tuple(plans)
-
-
-AT = 40
-LEG = [LIMBS["leftFoot"].upper, LIMBS["leftFoot"].lower, LIMBS["leftFoot"].end, CANONICAL.index("leftToes")]
-
-
-@pytest.fixture
-def jumping():
-    """A walk whose left leg is a third of a stride ahead from one frame on."""
-    motion = walk(90)
-    quats = motion.local_quat_xyzw.clone()
-    quats[AT:80, LEG] = motion.local_quat_xyzw[AT + 10 :, LEG]
-    return replace(motion, local_quat_xyzw=quats).slice(0, 80)
-
-
-def test_a_jump_is_regenerated_and_other_frames_stay(jumping):
-    assert find_jumps(jumping).nonzero()[:, 0].tolist() == [AT - 1]
-    result = repair_jumps(jumping, LinearInbetweener())
-    assert not bool(find_jumps(result).any())
-    others = torch.tensor([*range(AT - 7), *range(AT + 7, 80)])
-    assert torch.equal(result.root_position[others], jumping.root_position[others])
-    assert torch.equal(result.local_quat_xyzw[others], jumping.local_quat_xyzw[others])
-    moved = (result.joint_positions() - jumping.joint_positions())[AT - 1 : AT + 1].norm(dim=-1)
-    assert float(moved.max()) > 0.05
 
 
 @pytest.mark.slow
