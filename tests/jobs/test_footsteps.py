@@ -91,6 +91,16 @@ def test_there_is_a_step_at_least_every_second_and_a_half(rest):
     assert max(step.land - step.lift for step in plan) <= 45
 
 
+def test_a_displacement_out_of_a_corner_faces_along_the_curve(rest):
+    corner = curves.from_points(torch.tensor([[0.0, 0.0], [0.0, 2.0], [1.0, 1.0]], dtype=torch.float64), closed=False)
+    turned = math.radians(135)
+    start = move_to(rotate_about_vertical(rest, turned), torch.tensor([0.0, 2.0], dtype=torch.float64))
+    stop = move_to(rotate_about_vertical(rest, turned), torch.tensor([1.0, 1.0], dtype=torch.float64))
+    arcs = torch.tensor([2.0, corner.length], dtype=torch.float64)
+    heading = Displacement.along(corner, arcs, start, stop).track[:, 2]
+    torch.testing.assert_close(heading, torch.full_like(heading, turned), atol=1e-3, rtol=0)
+
+
 def test_last_steps_land_on_the_footholds_of_the_stand(rest):
     plan = plan_footsteps(displace(rest, 0.0, 1.2, 0.0), 73)
     steps = take_steps(displace(rest, 0.0, 1.2, 0.0), plan, 73)

@@ -35,6 +35,13 @@ STANDING = StandingEnds(start=True, end=True)
 # What is done when
 
 
+def test_a_walk_too_short_to_be_one_is_stepped():
+    speeds = torch.tensor([0.9] * 10 + [0.0] * 40, dtype=torch.float64)
+    for each, wanted in ((speeds, [(0, 1), (10, 50)]), (speeds.flip(0), [(0, 40), (49, 50)])):
+        spans = lay_timeline(each, slowest=0.5)
+        assert [(span.what, span.start, span.stop) for span in spans] == [("stand", *frames) for frames in wanted]
+
+
 def test_a_character_stands_walks_and_stands_again():
     speeds = TimedSpeed.parse(((0, 0), (1, 0), (2, 1.2), (5, 1.2), (6, 0), (7, 0), (8, 1.0))).at(270, 30)
     spans = lay_timeline(speeds, slowest=0.5)
