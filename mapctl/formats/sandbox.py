@@ -54,7 +54,7 @@ def call(reader: Callable[..., Any], path: str | PathLike[str], **options: Any) 
             raise FileFormatError(path, one_line(content, _LONGEST_MESSAGE))
         return content
     errors = done.stderr.decode(errors="replace")
-    if "MemoryError" in errors or "bad_alloc" in errors:
+    if any(sign in errors for sign in ("MemoryError", "bad_alloc", "failed to map segment")):
         raise FileFormatError(path, f"needs more than {MEMORY_BYTES >> 30} GiB of memory")
     if done.returncode == 1:
         raise RuntimeError(f"{path}: {(errors.strip().splitlines() or ['its reader cannot run'])[-1]}")
