@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from controllers.shots.footsteps import SIDES
 from controllers.shots.reaching import STRETCHED_SHARE, MetPose, ReachTargets, measure_look_errors, measure_pose_error
 from controllers.shots.request import Look, PoseKey, Reach, ShotRequest
 from controllers.shots.trajectory import Trajectory
@@ -100,7 +101,7 @@ def check_constraints(
         name = f"look at {round(look.seconds, 2):g} s"
         found.append(Constraint(name, "straight", worst, _LOOK_DEG, "degrees", seconds=_span(look)))
     for step in (step for step in request.footsteps if step.land < motion.num_frames):
-        toe, side, at = CANONICAL.index(TOES[step.foot]), ("left", "right")[step.foot], step.land / PRIOR_FPS
+        toe, side, at = CANONICAL.index(TOES[step.foot]), SIDES[step.foot], step.land / PRIOR_FPS
         miss = 100 * float((positions[step.land, toe, ::2] - positions.new_tensor(step.toe)).norm())
         found.append(
             Constraint(f"{side} foot at {at:.2f} s", "lands there", miss, _FOOTHOLD_CM, "cm", seconds=(at, at))

@@ -26,6 +26,8 @@ from mapctl.numerics.intervals import true_intervals
 from mapctl.skeleton import CANONICAL, FEET, LIMBS, TOES, leg_length
 from mapctl.terms import Keyframe
 
+SIDES = ("left", "right")
+"""Names of the feet, in the order of their numbers."""
 _LEGS = [LIMBS[name] for name in FEET]
 _SWING, _BOTH = 13, 4  # frames at PRIOR_FPS of a swing, and of double support before and after it
 _STEP, _TURN = 0.7, math.radians(75.0)  # of legs' length, and radians, that a foot is put ahead of the other at most
@@ -59,7 +61,7 @@ class Footstep:
     def as_row(self) -> dict[str, Any]:
         """Return the row of a report: foot, seconds of lift and landing, toe joint."""
         seconds = {"lift_seconds": self.lift / PRIOR_FPS, "land_seconds": self.land / PRIOR_FPS}
-        return {"foot": ("left", "right")[self.foot], **seconds, "toe": list(self.toe)}
+        return {"foot": SIDES[self.foot], **seconds, "toe": list(self.toe)}
 
 
 def find_footsteps(motion: Motion) -> list[Footstep]:
@@ -79,10 +81,8 @@ def hold_footsteps(steps: Sequence[Footstep], first: int, frames: int, toe_heigh
     positions = torch.zeros(frames, CANONICAL.num_joints, 3, dtype=torch.float64)
     wanted = torch.zeros(frames, CANONICAL.num_joints, dtype=torch.bool)
     for step in steps:
-        held, toe = (
-            slice(max(0, step.land - first), max(0, step.land + _HELD - first)),
-            CANONICAL.index(TOES[step.foot]),
-        )
+        toe = CANONICAL.index(TOES[step.foot])
+        held = slice(max(0, step.land - first), max(0, step.land + _HELD - first))
         positions[held, toe] = positions.new_tensor([step.toe[0], toe_height, step.toe[1]])
         wanted[held, toe] = True
     return Keyframe(positions, wanted, _FOOTHOLD_SIGMA, name="footholds")
@@ -195,11 +195,15 @@ def take_given(steps: Sequence[Footstep], start: int) -> list[Footstep]:
     """Return given steps as the plan of a displacement that begins at a frame; RequestError where a foot has none."""
     if {step.foot for step in steps} != {0, 1}:
         raise RequestError(f"the footsteps at {steps[0].lift / PRIOR_FPS:.2f} s lead to a stand and need both feet")
-    shares = [min(1.0, (number + 1) / (len(steps) - 1)) for number in range(len(steps))]
     return [
-        replace(step, lift=step.lift - start, land=step.land - start, share=share)
-        for step, share in zip(sorted(steps, key=lambda step: step.land), shares, strict=True)
+        replace(step, lift=step.lift - start, land=step.land - start, share=_share_of(number, len(steps)))
+        for number, step in enumerate(sorted(steps, key=lambda step: step.land))
     ]
+
+
+def _share_of(number: int, count: int) -> float:
+    """Return the share of a displacement at which a body stands over a step: the first and the last are half steps."""
+    return min(1.0, (number + 1) / max(1, count - 1))
 
 
 def _lay_steps(feet: Sequence[int], frames: int) -> list[Footstep]:
@@ -208,8 +212,7 @@ def _lay_steps(feet: Sequence[int], frames: int) -> list[Footstep]:
     both, plan = swing * _BOTH / _SWING, list[Footstep]()
     for number, foot in enumerate(feet):
         lift = both + number * (swing + both)
-        share = min(1.0, (number + 1) / max(1, count - 1))
-        plan.append(Footstep(foot, round(lift), round(lift + swing), share))
+        plan.append(Footstep(foot, round(lift), round(lift + swing), _share_of(number, count)))
     return plan
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from controllers.inbetweening.pipeline import fill
 from controllers.shots.footsteps import bend_legs
-from controllers.shots.request import Look, PoseKey, Reach, ShotRequest
+from controllers.shots.request import STANDING_SPEED, Look, PoseKey, Reach, ShotRequest
 from controllers.shots.seams import Filling, choose_filling
 from controllers.shots.trajectory import Trajectory, bend_trajectory
 from mapctl import kinematics, rotations
@@ -176,7 +176,7 @@ _STEP_ASIDE = 1.2  # metres between the trajectory and a body that leans and lea
 _BEND_LENGTH, _BEND_STEP = 1.2, 0.05  # metres of arc over which it bends toward a reach, and between its offsets
 _LEAST_BEND, _USUAL_BEND, _MOST_BEND = 0.1, 0.5, 0.9
 """Metres aside: less is left to the walk, more takes longer, more still is another trajectory."""
-_WALKING, _ARRIVED = 0.3, 15  # m/s of a trajectory that is bent toward a position, and frames after it was as fast
+_ARRIVED = 15  # frames after a walk in which its trajectory is bent toward a position
 _BEND_SHARES = (1.0, 0.7, 0.4)  # of a bend that are tried, where an obstacle blocks all of it
 _STRAIGHT_AHEAD = 0.6  # of a limb's length that it reaches down beside whatever it reaches aside
 _LEAST_CROUCH, _MOST_CROUCH, _POSED_FRAMES = 0.03, 0.3, 15  # metres down; frames beside a pose that is kept
@@ -216,7 +216,10 @@ def bend_toward_keys(trajectory: Trajectory, request: ShotRequest, rest: Motion)
         asides += [(arc, _find_lacking_aside(trajectory, arc, rest, *target)) for target in reach.positions.items()]
     for key in request.poses:
         frame = min(round(key.seconds * PRIOR_FPS), len(trajectory.arcs) - 1)
-        if key.place is not None and float(trajectory.speeds[max(0, frame - _ARRIVED) : frame + 1].max()) > _WALKING:
+        if (
+            key.place is not None
+            and float(trajectory.speeds[max(0, frame - _ARRIVED) : frame + 1].max()) > STANDING_SPEED
+        ):
             arc = trajectory.arcs[frame]
             ground = trajectory.arcs.new_tensor(key.place) - trajectory.curve.ground_point(arc)
             asides.append((arc, float(ground @ trajectory.curve.left(arc))))

@@ -254,7 +254,9 @@ def go_on(motion: Motion, missing: Bool[Tensor, " frames"], lead: Lead, inbetwee
         whole = past.join(fill_frames(motion, missing, inbetweener) if bool(missing.any()) else motion)
         if not lead.stands:
             tried = [Filling.of_frames(whole, count + 1, count + 1 + width) for width in _SEAMS]
-            whole = _fill_best([replace(each, around=(count + 1, count + 27)) for each in tried], inbetweener)
+            whole = _fill_best(
+                [replace(each, around=(count + 1, count + 1 + max(_SEAMS))) for each in tried], inbetweener
+            )
     return whole.slice(count, whole.num_frames)
 
 

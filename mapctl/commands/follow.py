@@ -63,8 +63,7 @@ def run(command: FollowCurve) -> int:
     options.check_seed(command.seed)
     if command.fps is not None and not 1 <= command.fps <= 1000:
         raise RequestError(f"--fps must be 1 to 1000, got {command.fps:g}")
-    if command.variations < 1:
-        raise RequestError(f"--variations must be at least 1, got {command.variations}")
+    options.check_variations(command.variations)
     formats.check_ending(command.out)
     takes = [command] if command.variations == 1 else [_number(command, take) for take in range(command.variations)]
     outputs.check_files([path for take in takes for path in options.collect_paths(take.out, take.video, take.report)])

@@ -58,8 +58,7 @@ def run(command: RunScene) -> int:
     """
     path = Path(scenes.find_scene(command.scene))
     scene, curves = load(path)
-    if command.variations < 1:
-        raise RequestError(f"--variations must be at least 1, got {command.variations}")
+    options.check_variations(command.variations)
     takes = [scene] if command.variations == 1 else [_number(scene, take) for take in range(command.variations)]
     with priors.use_weights(command.weights or scene.weights):
         return max(_run_scene(command, path, take, curves) for take in takes)

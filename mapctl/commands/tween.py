@@ -79,7 +79,6 @@ class Tween(ModelCommand, options.RigOptions, options.ProposalOptions):
     """No summary and no progress bar."""
 
 
-_MAX_VARIATIONS = 1000
 _IN_STYLE = " in the style of "
 
 
@@ -137,8 +136,7 @@ def _check(command: Tween, request: KeyRequest | None) -> None:
         raise RequestError(f"{unused[0]} is for motion files; {command.source} holds its own keys")
     if request is None and command.keyframes is None:
         raise RequestError("a motion file needs --keyframes, its frames that are keys (see mapctl tween --help)")
-    if not 1 <= command.variations <= _MAX_VARIATIONS:
-        raise RequestError(f"--variations must be 1 to {_MAX_VARIATIONS}, got {command.variations}")
+    options.check_variations(command.variations)
     given, several = [command.source, *map(Path, () if request is None else request.files)], command.variations > 1
     # Variations are rollouts of a density with every method.
     results.check_proposal(command, prior=None if several else command.prior)

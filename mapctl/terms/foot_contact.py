@@ -38,8 +38,7 @@ class LandingSigmas:
     its frames on: without this the first may be anywhere, and a foot can snap to its position within one frame."""
 
     free: float = 70.0
-    """Acceleration of a toe that costs nothing, m/s^2. With it the largest of hands and toes relative to the hips is 39
-    to 74 along five curves at 1.2 m/s, and 76 around a circle at 2.4 m/s."""
+    """Acceleration of a toe that costs nothing, m/s^2."""
     sigma: float = 10.0
     """Standard deviation of what is beyond it, m/s^2."""
 

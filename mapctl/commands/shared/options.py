@@ -88,6 +88,12 @@ def check_seed(seed: int) -> None:
         raise RequestError(f"the seed must be a whole number from 0 to 2^63 - 1, got {seed}")
 
 
+def check_variations(count: int) -> None:
+    """Raise RequestError for no variations, and for more than their three digits number."""
+    if not 1 <= count <= 1000:
+        raise RequestError(f"--variations must be 1 to 1000, got {count}")
+
+
 def parse_size(text: str) -> tuple[int, int]:
     """Parse `1280x720` as width and height in pixels."""
     found = re.fullmatch(r"(\d{1,5})[xX](\d{1,5})", text)

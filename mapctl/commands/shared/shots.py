@@ -13,7 +13,7 @@ from torch import Tensor
 
 import priors
 from controllers.common.character import Character
-from controllers.shots.footsteps import Footstep
+from controllers.shots.footsteps import SIDES, Footstep
 from controllers.shots.reaching import build_rest_pose
 from controllers.shots.request import Arrival, Lead, Look, Others, PoseKey, Reach, ShotRequest
 from controllers.shots.shot import ShotSolution, solve_shot
@@ -136,7 +136,7 @@ def plan_shot(
         poses=tuple(poses),
         footsteps=tuple(
             Footstep(
-                ("left", "right").index(step.foot),
+                SIDES.index(step.foot),
                 round(step.lift_seconds * PRIOR_FPS),
                 round(step.land_seconds * PRIOR_FPS),
                 toe=step.toe,
