@@ -110,6 +110,11 @@ class Command:
             if len(position) != 3 or not all(map(math.isfinite, position)):
                 raise RequestError(f"the position for {name} must be three finite numbers of metres, got {position}")
 
+    @property
+    def hips_heading(self) -> float:
+        """Facing of the hips, radians: the given one, else the direction of travel."""
+        return self.heading if self.facing is None else self.facing
+
     def within(self, fastest: float, *, when: str = "") -> tuple["Command", list[str]]:
         """Limit the command to what can be held: at most `fastest` m/s, steps of STEP_LENGTHS, and angles of one turn.
 

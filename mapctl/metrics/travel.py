@@ -24,15 +24,17 @@ _HELD_DISTANCE = 0.01  # metres from its position within which a hand is there
 _STEADY_AFTER = 2.0  # seconds: from then on a command counts as obeyed or not
 _HOLD_SECONDS = 0.4  # seconds for which a command must hold to count as reached
 _UNDER_WAY_SHARE, _UNDER_WAY_ANGLE = 0.5, math.radians(30)  # of the speed; radians off the direction
-_NEAR_SPEED, _NEAR_STILL, _NEAR_ANGLE = 0.15, 0.15, math.radians(10)  # share of the speed; m/s at rest; radians
+_NEAR_SPEED, _NEAR_STILL = 0.15, 0.15  # share of the speed; m/s at rest
+_NEAR_ANGLE, _NEAR_FACING = math.radians(10), math.radians(15)  # radians of travel, and of the facing while it goes
 
 
-class _SlowVelocity(NamedTuple):
-    """Slow velocity of the hips over the ground, frame by frame."""
+class _SlowTravel(NamedTuple):
+    """Slow velocity of the hips over the ground and their slow facing, frame by frame."""
 
     seconds: Float[ndarray, " frames"]
     speed: Float[ndarray, " frames"]  # m/s
     direction: Float[ndarray, " frames"]  # of travel, radians about +Y; meaningless where the speed is near 0
+    facing: Float[ndarray, " frames"]  # of the hips, radians about +Y
 
 
 def measure_commands(motion: Motion, track: CommandTrack) -> list[dict[str, float | None]]:
@@ -42,17 +44,19 @@ def measure_commands(motion: Motion, track: CommandTrack) -> list[dict[str, floa
     it never was), under_way_s (from when on it goes at half the speed and more within 30 degrees of the direction; None
     if never, and where standing or turning on and on was wanted), steady_speed_mps (net displacement over time; mean
     speed while turning), steady_heading_error_deg and steady_turn_deg_s (None where the other, standing, or no steady
-    part was wanted), step_m and steady_step_m (None unless a step length was wanted). For each hand with a place:
-    `<hand>_nearest_cm`, and `<hand>_held_s`, the seconds in which it was within a centimetre of it; `look_nearest_deg`,
-    the least angle between where the head faces and what is looked at; `clearance_cm`, of the nearest joint to an
-    obstacle.
+    part was wanted), facing_deg (wanted, the direction of travel unless another was given; None while turning on and
+    on) and steady_facing_error_deg, step_m and steady_step_m (None unless a step length was wanted). For each hand with
+    a position: `<hand>_nearest_cm`, and `<hand>_held_s`, the seconds in which it was within a centimetre of it;
+    `look_nearest_deg`, the least angle between where the head faces and what is looked at; `clearance_cm`, of the
+    nearest joint to an obstacle.
     """
     positions, fps, rows = motion.joint_positions(), float(motion.fps), []
     ground = positions[:, 0, ::2].numpy()
-    slow = np.gradient(ground, axis=0) * fps
-    slow = scipy.ndimage.gaussian_filter1d(slow, _SLOW_SECONDS * fps, axis=0, mode="nearest")
+    facing = rotations.unwrap_angle(heading(motion.local_quat_xyzw[:, 0])).numpy()
+    moving = np.column_stack([np.gradient(ground, axis=0) * fps, facing])
+    slow = scipy.ndimage.gaussian_filter1d(moving, _SLOW_SECONDS * fps, axis=0, mode="nearest")
     seconds, directions = np.arange(len(ground)) / fps, np.arctan2(slow[:, 0], slow[:, 1])
-    velocity = _SlowVelocity(seconds, np.linalg.norm(slow, axis=-1), directions)
+    velocity = _SlowTravel(seconds, np.linalg.norm(slow[:, :2], axis=-1), directions, slow[:, 2])
     toes = positions[:, list(find_feet(motion.skeleton))]
     steps = step_lengths(toes[..., ::2], contacts.detect_contacts(toes, fps), fps).numpy()
     ends = [*track.times[1:], float(velocity.seconds[-1])]
@@ -64,6 +68,7 @@ def measure_commands(motion: Motion, track: CommandTrack) -> list[dict[str, floa
             "speed_mps": command.speed,
             "turn_deg_s": turning,
             "heading_deg": math.degrees(command.heading),
+            "facing_deg": None if command.turning is not None else math.degrees(command.hips_heading),
         }
         row["reached_s"] = _find_time_reached(velocity, part, began, command, float(motion.fps))
         row["under_way_s"] = _find_travel_time(velocity, part, began, command)
@@ -93,9 +98,12 @@ def _measure_positions(motion: Motion, positions: Tensor, frames: ndarray, comma
 
 
 def _find_time_reached(
-    velocity: _SlowVelocity, part: ndarray, began: float, command: Command, fps: float
+    velocity: _SlowTravel, part: ndarray, began: float, command: Command, fps: float
 ) -> float | None:
     near = np.abs(velocity.speed - command.speed) < max(_NEAR_SPEED * command.speed, _NEAR_STILL)
+    if command.turning is None:
+        turned = np.abs(rotations.wrap_angle(velocity.facing - command.hips_heading))
+        near &= turned < (_NEAR_FACING if command.speed > 0 else _NEAR_ANGLE)
     if command.speed > 0 and command.turning is None:
         near &= np.abs(rotations.wrap_angle(velocity.direction - command.heading)) < _NEAR_ANGLE
     at, held = np.flatnonzero(part), round(_HOLD_SECONDS * fps)
@@ -105,7 +113,7 @@ def _find_time_reached(
     return None
 
 
-def _find_travel_time(velocity: _SlowVelocity, part: ndarray, began: float, command: Command) -> float | None:
+def _find_travel_time(velocity: _SlowTravel, part: ndarray, began: float, command: Command) -> float | None:
     if command.speed == 0 or command.turning is not None:
         return None
     along = velocity.speed * np.cos(velocity.direction - command.heading)
@@ -115,10 +123,10 @@ def _find_travel_time(velocity: _SlowVelocity, part: ndarray, began: float, comm
 
 
 def _measure_steady_errors(
-    velocity: _SlowVelocity, ground: ndarray, frames: ndarray, command: Command, fps: float
+    velocity: _SlowTravel, ground: ndarray, frames: ndarray, command: Command, fps: float
 ) -> dict[str, float | None]:
     found: dict[str, float | None] = dict.fromkeys(
-        ("steady_speed_mps", "steady_heading_error_deg", "steady_turn_deg_s")
+        ("steady_speed_mps", "steady_heading_error_deg", "steady_facing_error_deg", "steady_turn_deg_s")
     )
     if len(frames) < fps / 2:
         return found
@@ -129,6 +137,8 @@ def _measure_steady_errors(
     step = (ground[frames[-1]] - ground[frames[0]]) * fps / (len(frames) - 1)
     off = math.degrees(float(rotations.wrap_angle(math.atan2(step[0], step[1]) - command.heading)))
     found["steady_speed_mps"] = float(np.linalg.norm(step))
+    turned = float(velocity.facing[frames].mean()) - command.hips_heading
+    found["steady_facing_error_deg"] = math.degrees(float(rotations.wrap_angle(turned)))
     return found | {"steady_heading_error_deg": off if command.speed > 0 else None}
 
 

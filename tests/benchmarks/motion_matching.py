@@ -1,13 +1,13 @@
-"""Motion matching along a curve: what a game would use instead of a density and a solver (Clavet 2016; features as in
-Holden et al. 2020, section 3, with the weights of their published demo).
+"""Motion matching along a curve or by commands: what a game would use instead of a density and a solver (Clavet 2016;
+features as in Holden et al. 2020, section 3, with the weights of their published demo).
 
 Capture is played; five times a second the frame whose pose is nearest to the one that is played, and whose next second
-is nearest to the curve ahead, is searched among all, and what jumps then fades (inertialisation, Bollo 2018). The root
-goes where the capture goes: nothing pulls it to the curve.
+is nearest to the trajectory ahead, is searched among all, and what jumps then fades (inertialisation, Bollo 2018). The
+root goes where the capture goes: nothing pulls it to the curve.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -22,6 +22,7 @@ from mapctl import rotations
 from mapctl.curves import Curve
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, integrate_root, mirror_features
+from mapctl.intent.steering import Command, SteeringLimits, SteeringTarget
 from mapctl.motion import Motion
 from mapctl.pose import decode
 from mapctl.skeleton import CANONICAL
@@ -96,10 +97,9 @@ class MotionDatabase:
         """Index of the candidates by their columns."""
         return scipy.spatial.KDTree(self.columns[self.candidates])
 
-    def look_ahead(self, curve: Curve, arc: float, ground: GroundPose, speed: float) -> Float[ndarray, " ahead"]:
-        """Describe the curve ahead of a ground pose as the last columns describe what a frame's clip does next."""
-        arcs = arc + speed * torch.tensor(self.settings.ahead, dtype=torch.float64)
-        seen = _see(curve.ground_point(arcs), curve.heading(arcs), ground.position_xz, ground.heading)
+    def look_ahead(self, ahead: GroundPose, ground: GroundPose) -> Float[ndarray, " ahead"]:
+        """Describe ground poses ahead of one as the last columns describe what a frame's clip does next."""
+        seen = _see(ahead.position_xz, ahead.heading, ground.position_xz, ground.heading)
         return seen.flatten().numpy() * self.scale[-seen.numel() :]
 
 
@@ -107,16 +107,55 @@ def follow_by_matching(
     database: MotionDatabase, curve: Curve, *, seconds: float, speed: float, generator: torch.Generator
 ) -> Motion:
     """Follow a curve for so many seconds at a speed, m/s, from its start; returns the motion at PRIOR_FPS."""
-    settings, tree = database.settings, database.tree
-    ground = GroundPose(curve.ground_point(0.0).double(), torch.tensor(curve.start_heading, dtype=torch.float64))
-    playing, arc, frames = _choose_start(database, curve, ground, speed, generator), 0.0, []
+    arc, ahead = 0.0, torch.tensor(database.settings.ahead, dtype=torch.float64)
+
+    def lead(frame: int, ground: GroundPose) -> GroundPose:
+        nonlocal arc
+        arc = float(curve.nearest(ground.position_xz[None], torch.tensor([arc]), reach=0.5)[0]) if frame else 0.0
+        arcs = arc + speed * ahead
+        return GroundPose(curve.ground_point(arcs), curve.heading(arcs))
+
+    start = GroundPose(curve.ground_point(0.0).double(), torch.tensor(curve.start_heading, dtype=torch.float64))
+    return _play(database, lead, start, round(seconds * PRIOR_FPS), generator)
+
+
+def steer_by_matching(
+    database: MotionDatabase, command_at: Callable[[float], Command], *, frames: int, generator: torch.Generator
+) -> Motion:
+    """Answer commands from the origin on; the trajectory ahead is that of steering targets within their limits."""
+    limits, seconds = SteeringLimits(), max(database.settings.ahead)
+    first = command_at(0.0)
+    target, last = SteeringTarget(first.speed, first.heading, first.hips_heading), 0
+
+    def lead(frame: int, ground: GroundPose) -> GroundPose:
+        nonlocal target, last
+        command = command_at(frame / PRIOR_FPS)
+        if frame > last:
+            target, last = target.ahead(command, limits, frames=frame - last, fps=PRIOR_FPS)[-1], frame
+        coming = target.ahead(command, limits, frames=round(seconds * PRIOR_FPS), fps=PRIOR_FPS)
+        path = ground.position_xz + torch.tensor([each.velocity for each in coming]).double().cumsum(0) / PRIOR_FPS
+        at = [round(each * PRIOR_FPS) - 1 for each in database.settings.ahead]
+        return GroundPose(path[at], torch.tensor([coming[index].facing for index in at], dtype=torch.float64))
+
+    start = GroundPose(torch.zeros(2).double(), torch.tensor(first.hips_heading, dtype=torch.float64))
+    return _play(database, lead, start, frames, generator)
+
+
+def _play(
+    database: MotionDatabase,
+    lead: Callable[[int, GroundPose], GroundPose],
+    start: GroundPose,
+    frames: int,
+    generator: torch.Generator,
+) -> Motion:
+    """Play so many frames from a ground pose; `lead` returns the ground poses ahead of a frame and its own."""
+    settings, tree, ground = database.settings, database.tree, start
+    playing, played = _choose_start(database, database.look_ahead(lead(0, start), start), generator), []
     fading = _Fading(np.zeros(LAYOUT.continuous), np.zeros(LAYOUT.continuous), 0)
     step = round(settings.every * PRIOR_FPS)
-    start = ground
-    for number in range(round(seconds * PRIOR_FPS)):
+    for number in range(frames):
         if number and (number % step == 0 or playing >= database.last[playing]):
-            arc = float(curve.nearest(ground.position_xz[None], torch.tensor([arc]), reach=0.5)[0])
-            ahead = database.look_ahead(curve, arc, ground, speed)
+            ahead = database.look_ahead(lead(number, ground), ground)
             wanted = np.concatenate([database.columns[playing, : -len(ahead)], ahead])
             found = int(database.candidates[tree.query(wanted)[1]])
             if found != playing:
@@ -124,13 +163,13 @@ def follow_by_matching(
                 playing = found
         values = database.features[playing].astype(np.float64)
         values[: LAYOUT.continuous] += fading.offset(settings)
-        frames.append(values)
+        played.append(values)
         fading, moved = fading.next(), torch.from_numpy(values)
         ground = ground.displace(
             LAYOUT.pick(moved, "root_displacement_heading"), LAYOUT.pick(moved, "heading_change")[0]
         )
         playing = min(playing + 1, int(database.last[playing]))
-    return decode(torch.from_numpy(np.stack(frames)), start)
+    return decode(torch.from_numpy(np.stack(played)), start)
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,11 +248,9 @@ def _scale_groups(
     return np.array(scale)
 
 
-def _choose_start(
-    database: MotionDatabase, curve: Curve, ground: GroundPose, speed: float, generator: torch.Generator
-) -> int:
-    """Draw one of the frames whose next second is nearest to the curve's beginning."""
-    wanted, most = database.look_ahead(curve, 0.0, ground, speed), database.settings.starts
+def _choose_start(database: MotionDatabase, wanted: Float[ndarray, " ahead"], generator: torch.Generator) -> int:
+    """Draw one of the frames whose next second is nearest to that wanted."""
+    most = database.settings.starts
     away = np.square(database.columns[database.candidates, -len(wanted) :] - wanted).sum(axis=1)
     best = np.argpartition(away, min(most, len(away) - 1))[:most]
     return int(database.candidates[best[int(torch.randint(len(best), (1,), generator=generator))]])

@@ -9,7 +9,7 @@ RUNS = {
     "inbetween --lafan": ["--windows", "1"],
     "denoise": ["--seconds", "2.5"],
     "follow": ["--walks", "1"],
-    "steer": ["--commands", "1"],
+    "steer": ["--commands", "6", "--stand", "3"],
     "generate": ["--seconds", "2"],
     "shots": ["--shots", "1"],
     "speed": ["--seconds", "2.5"],
