@@ -1,7 +1,5 @@
-"""Paces, and changes of pace: starts, stops, and changes between a walk and a run, by the hips' smoothed speed; and
-travel: stands, turns on the spot, and the direction of steps as the body sees it."""
+"""Paces, and changes of pace: starts, stops, and changes between a walk and a run, by the hips' smoothed speed."""
 
-import math
 from itertools import pairwise
 
 import numpy as np
@@ -31,37 +29,6 @@ CHANGES = {
 def label_pace(pace: str) -> str:
     """Return the label of a pace, `pace=walk`, for a density that is conditioned on it."""
     return f"pace={pace}"
-
-
-DIRECTIONS = "ahead", "ahead-left", "left", "back-left", "back", "back-right", "right", "ahead-right"
-"""Directions of travel about the facing, 45 degrees apart, toward the left first."""
-TRAVELS = "stand", "turn-left", "turn-right", *DIRECTIONS
-"""Kinds of travel."""
-_SETTLE_SECONDS = 0.3  # standard deviation of a Gaussian over the steps of a turn on the spot
-_TRAVELS, _TURNS = 0.15, 0.5  # m/s from which on it travels; rad/s from which on a body that does not turns
-
-
-def label_travel(travel: str) -> str:
-    """Return the label of a kind of travel, `travel=back`, for a density that is conditioned on it."""
-    return f"travel={travel}"
-
-
-def find_direction(angle: float) -> str:
-    """Find the direction of travel at an angle to the left of the facing, radians."""
-    return DIRECTIONS[round(angle / (math.pi / 4)) % len(DIRECTIONS)]
-
-
-def follow_travel(
-    ground: Float[ndarray, "frames 2"], heading: Float[ndarray, " frames"], fps: float
-) -> Int[ndarray, " frames"]:
-    """Follow the kind of travel of hips over the ground, x and z in metres, with their heading, radians, not wrapped:
-    the index in TRAVELS of each of at least two frames."""
-    moving = np.gradient(np.column_stack([ground, heading]), 1 / fps, axis=0)
-    slow = gaussian_filter1d(moving, _SETTLE_SECONDS * fps, axis=0, mode="nearest")
-    angle = np.arctan2(slow[:, 0], slow[:, 1]) - gaussian_filter1d(heading, _SETTLE_SECONDS * fps, mode="nearest")
-    direction = np.round(angle / (math.pi / 4)).astype(int) % len(DIRECTIONS)
-    turns = np.where(np.abs(slow[:, 2]) < _TURNS, 0, np.where(slow[:, 2] > 0, 1, 2))
-    return np.where(np.linalg.norm(slow[:, :2], axis=1) < _TRAVELS, turns, direction + len(TRAVELS) - len(DIRECTIONS))
 
 
 def compute_ground_velocity(ground: Float[ndarray, "frames 2"], fps: float) -> Float[ndarray, "frames 2"]:

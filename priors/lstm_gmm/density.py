@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
-from mapctl.metrics.gait import CHANGES, PACES, TRAVELS, find_pace, label_pace, label_travel
+from mapctl.metrics.gait import CHANGES, PACES, find_pace, label_pace
 from mapctl.protocols import DataLimits, Density, DiscreteChoices, InitialStates, PreparedRollout
 from mapctl.solver.budget import Budget, Meter
 from mapctl.solver.lbfgs import LbfgsSettings, differentiate, minimise
@@ -87,8 +87,6 @@ def _parse_match(match: re.Match[str] | None) -> set[str]:
 
 PACE_LABELS = tuple(map(label_pace, PACES))
 """Labels of PACES."""
-TRAVEL_LABELS = tuple(map(label_travel, TRAVELS))
-"""Labels of TRAVELS."""
 
 
 def read_pace_rates(holds: Mapping[str, Any]) -> dict[tuple[str, str], float]:

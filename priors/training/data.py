@@ -25,7 +25,7 @@ from mapctl.errors import FileFormatError, MapctlError, RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root
 from mapctl.formats import load
 from mapctl.formats.text import read_table
-from mapctl.metrics.gait import CHANGES, PACES, count_pace_changes, follow_pace, follow_travel, measure_speed
+from mapctl.metrics.gait import CHANGES, PACES, count_pace_changes, follow_pace, measure_speed
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap, identify_rig, rigs
 from mapctl.retarget.carry import RiggedCharacter, retarget_canonical
@@ -470,14 +470,6 @@ def _follow_speeds(corpus: Corpus) -> list[NDArray[np.floating]]:
 def follow_paces(corpus: Corpus) -> Int[Tensor, " frames"]:
     """Follow the pace of all clips, joined: the index in PACES of each frame."""
     return torch.from_numpy(np.concatenate([follow_pace(speed) for speed in _follow_speeds(corpus)]))
-
-
-def follow_travels(corpus: Corpus) -> Int[Tensor, " frames"]:
-    """Follow the kind of travel of all clips, joined: the index in TRAVELS of each frame."""
-    roots = (root.split(list(corpus.lengths)) for root in corpus.integrate_roots())
-    clips = [(ground.double().numpy(), heading.double().numpy()) for ground, heading in zip(*roots, strict=True)]
-    found = [follow_travel(*clip, PRIOR_FPS) if len(clip[1]) > 1 else np.zeros(1, int) for clip in clips]
-    return torch.from_numpy(np.concatenate(found))
 
 
 def measure_pace_changes(corpus: Corpus) -> dict[str, Any]:

@@ -1,19 +1,9 @@
 """Starts, stops and changes of gait: counted where both bounds are passed, for cards and for free runs alike."""
 
-import math
-
 import numpy as np
 import pytest
 
-from mapctl.metrics.gait import (
-    CHANGES,
-    TRAVELS,
-    compute_ground_velocity,
-    count_pace_changes,
-    find_direction,
-    follow_pace,
-    follow_travel,
-)
+from mapctl.metrics.gait import CHANGES, compute_ground_velocity, count_pace_changes, follow_pace
 
 
 @pytest.mark.parametrize(
@@ -61,28 +51,3 @@ def test_sway_within_a_stride_is_no_change(fps):
 )
 def test_a_pace_lasts_until_the_other_bound(speeds, expected):
     assert follow_pace(np.repeat(np.array(speeds), 5)).tolist() == [pace for pace in expected for _ in range(5)]
-
-
-@pytest.mark.parametrize(
-    ("speed", "angle", "turn", "expected"),
-    [
-        (0.0, 0.0, 0.0, "stand"),
-        (0.05, 0.0, 1.2, "turn-left"),
-        (0.05, 0.0, -1.2, "turn-right"),
-        (1.2, 0.0, 0.4, "ahead"),
-        (0.7, 180.0, 0.0, "back"),
-        (0.4, 90.0, 0.0, "left"),
-        (0.4, -90.0, 0.0, "right"),
-        (0.8, -130.0, 0.0, "back-right"),
-        (0.8, 40.0, 0.0, "ahead-left"),
-    ],
-)
-def test_travel_is_seen_from_the_body(speed, angle, turn, expected):
-    """Angles of travel to the left of the facing, degrees; turns in radians/s."""
-    heading = 0.7 + turn * np.arange(60) / 30
-    direction = heading + math.radians(angle)
-    velocity = speed * np.column_stack([np.sin(direction), np.cos(direction)])
-    found = follow_travel(np.cumsum(velocity, axis=0) / 30, heading, 30.0)
-    assert {TRAVELS[index] for index in found[10:50]} == {expected}
-    if speed > 0.1:
-        assert find_direction(math.radians(angle)) == expected

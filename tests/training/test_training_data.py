@@ -22,7 +22,7 @@ from mapctl.features import LAYOUT, GroundPose, encode, ground_speed
 from mapctl.motion import Motion
 from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOE_REST_HEIGHT
-from priors.lstm_gmm.density import PACE_LABELS, TRAVEL_LABELS, Labels, read_pace_rates
+from priors.lstm_gmm.density import PACE_LABELS, Labels, read_pace_rates
 from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig
 from priors.training import data as corpora
 from priors.training.data import (
@@ -31,7 +31,6 @@ from priors.training.data import (
     FrameCuts,
     find_floor_slope,
     follow_paces,
-    follow_travels,
     measure_pace_changes,
     read_clip_features,
     read_corpus,
@@ -462,9 +461,7 @@ def trainer(clips, tmp_path):
     names = ("gait=walk", *PACE_LABELS)
     known = Labels(("gait=walk",), torch.tensor([[0.0], [1.0], [0.0]])).renamed(names)
     settings = small_settings("lstm-gmm", tmp_path, tmp_path, batch=64, window=WINDOW)
-    return DensityTrainer(
-        settings, clips, LstmGmmConfig(width=4, labels=names), known, {PACE_LABELS: follow_paces(clips)}
-    )
+    return DensityTrainer(settings, clips, LstmGmmConfig(width=4, labels=names), known, follow_paces(clips))
 
 
 def test_a_window_is_labelled_by_how_it_ends(trainer, clips, monkeypatch):
@@ -477,22 +474,6 @@ def test_a_window_is_labelled_by_how_it_ends(trainer, clips, monkeypatch):
         assert row[1:].tolist() in (np.eye(3)[ends].tolist(), [0, 0, 0])  # some windows are shown no pace
         seen.add((int(paces[first]), ends))
     assert {(0, 0), (0, 1), (1, 0), (1, 2)} <= seen
-
-
-def test_a_mirrored_window_travels_to_the_other_side(tmp_path, monkeypatch):
-    """Frames of a body that steps to its left: the label follows the window into the mirror."""
-    features = go_at(1.0, seconds=4)
-    features[:, LAYOUT.slices["root_displacement_heading"]] = torch.tensor([0.02, 0.0])
-    clips = Corpus(("a",), (len(features),), features)
-    settings = small_settings("lstm-gmm", tmp_path, tmp_path, batch=32, window=WINDOW)
-    labels = Labels(TRAVEL_LABELS, torch.zeros(1, len(TRAVEL_LABELS)))
-    config = LstmGmmConfig(width=4, labels=TRAVEL_LABELS)
-    trainer = DensityTrainer(settings, clips, config, labels, {TRAVEL_LABELS: follow_travels(clips)})
-    drawn = trainer.windows.draw(32, generator(3))
-    monkeypatch.setattr(trainer.windows, "draw", lambda *_, **__: drawn)
-    given = [{TRAVEL_LABELS[i] for i in row.nonzero()[:, 0]} for row in trainer.draw_windows()[1]]
-    pairs = {(mirrored, *travel) for mirrored, travel in zip(drawn.mirrored.tolist(), given, strict=True) if travel}
-    assert pairs == {(False, "travel=left"), (True, "travel=right")}
 
 
 def test_rates_are_those_of_the_clips(clips):
@@ -529,4 +510,4 @@ def test_a_density_that_is_trained_so_knows_paces(tmp_path, capfd):
     assert priors.load(str(tmp_path / "plain")).pace_rates == {}
     capfd.readouterr()
     assert run("train", "lstm-gmm", "-o", tmp_path / "no", *more, "--label-pace", "--init", tmp_path / "plain") == 2
-    assert "has no labels of pace; leave --label-pace out" in capfd.readouterr().err
+    assert "was not trained with labels of paces; leave --label-pace out" in capfd.readouterr().err

@@ -8,9 +8,9 @@ too.
 
 import copy
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Annotated, TypeAlias
+from typing import Annotated
 
 import torch
 from jaxtyping import Float, Int
@@ -27,7 +27,7 @@ from mapctl.problem import density_selection
 from mapctl.protocols import DataLimits, InitialStates
 from priors.checkpoints import require_at_least
 from priors.lstm_gmm import density
-from priors.lstm_gmm.density import PACE_LABELS, TRAVEL_LABELS, Labels
+from priors.lstm_gmm.density import PACE_LABELS, Labels
 from priors.lstm_gmm.network import NOISE_UNIT, PAPER, LstmGmm, LstmGmmConfig, LstmState
 from priors.training.augment import add_copies
 from priors.training.critics import (
@@ -39,7 +39,7 @@ from priors.training.critics import (
     moment_loss,
     run_free,
 )
-from priors.training.data import Corpus, Split, follow_paces, follow_travels, measure_pace_changes
+from priors.training.data import Corpus, Split, follow_paces, measure_pace_changes
 from priors.training.loop import (
     Count,
     Export,
@@ -75,11 +75,6 @@ _WARM_UP_FRAMES = 40  # frames of a clip before a start; the memory has settled 
 _SETTLING_FRAMES = 300
 
 
-FrameLabels: TypeAlias = tuple[str, tuple[str, ...], Callable[[Corpus], Int[Tensor, " frames"]]]
-"""A group, its labels, and a function to the index in them of each frame of a corpus."""
-_FRAME_LABELS: list[FrameLabels] = [("pace", PACE_LABELS, follow_paces), ("travel", TRAVEL_LABELS, follow_travels)]
-
-
 @dataclass(frozen=True, kw_only=True)
 class DensitySettings(NetworkSettings):
     """Train the density that follow, generate, steer and others use as their prior."""
@@ -105,9 +100,6 @@ class DensitySettings(NetworkSettings):
     label_pace: bool = False
     """Make the pace a label as well: stand, walk or run, by how a window of training ends. Random motion is then given
     one pace after another, as often as the clips change theirs."""
-    label_travel: bool = False
-    """Make the kind of travel a label as well, by how a window of training ends: stand, turn on the spot, or one of
-    eight directions about the facing. Steering conditions the density on what a command leads to."""
     copies: Count = 0
     """Copies of each clip at other tempos and with other strides that training sees beside it: for a few minutes of
     motion (docs/guides/data.md)."""
@@ -129,9 +121,8 @@ class DensitySettings(NetworkSettings):
             )
         if self.critic_steps and self.window < SEEN_FRAMES:
             raise RequestError(f"the critic sees {SEEN_FRAMES} frames; windows have {self.window}")
-        for group, _, _ in self._frame_labels():
-            if f"(?P<{group}>" in self.labels:
-                raise RequestError(f"the group {group} is that of --label-{group}; name that of --labels otherwise")
+        if self.label_pace and "(?P<pace>" in self.labels:
+            raise RequestError("the group pace is that of --label-pace; call the one of --labels by another name")
 
     def make_trainer(self, parts: Split) -> "DensityTrainer":
         """Make the trainer of a network for the clips' labels, or of the initial network with its own labels."""
@@ -141,21 +132,14 @@ class DensitySettings(NetworkSettings):
         corpus = copied.to(torch.get_default_device().type)
         known, config = density.read_labels(corpus.names, self.labels), self.find_config()
         if self.init is None:
-            known = known.renamed((*known.names, *(name for _, names, _ in self._frame_labels() for name in names)))
+            known = known.renamed((*known.names, *PACE_LABELS)) if self.label_pace else known
             config = replace(config, labels=known.names)
         known = known.renamed(config.labels)
-        for group, names, _ in self._frame_labels():
-            if not {*names} <= {*config.labels}:
-                raise RequestError(f"the prior {self.init!r} has no labels of {group}; leave --label-{group} out")
-        device = corpus.features.device
-        frames = {
-            names: follow(copied).to(device) for _, names, follow in _FRAME_LABELS if {*names} <= {*config.labels}
-        }
-        return DensityTrainer(self, corpus, config, known, frames)
-
-    def _frame_labels(self) -> list[FrameLabels]:
-        """Return the groups of labels of frames that are wanted."""
-        return [labels for labels in _FRAME_LABELS if getattr(self, f"label_{labels[0]}")]
+        with_paces = {*PACE_LABELS} <= {*config.labels}
+        if self.label_pace and not with_paces:
+            raise RequestError(f"the prior {self.init!r} was not trained with labels of paces; leave --label-pace out")
+        paces = follow_paces(copied).to(corpus.features.device) if with_paces else None
+        return DensityTrainer(self, corpus, config, known, paces)
 
 
 class DensityTrainer(GradientTrainer[LstmGmm]):
@@ -167,17 +151,14 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         corpus: Corpus,
         config: LstmGmmConfig,
         labels: Labels | None = None,
-        frame_labels: Mapping[tuple[str, ...], Int[Tensor, " frames"]] | None = None,
+        paces: Int[Tensor, " frames"] | None = None,
     ):
-        """`labels` of the corpus' clips, the network's own, with those of frames held by none; `frame_labels` are
-        groups of them, with the index in the group that each of the corpus' frames has."""
+        """`labels` of the corpus' clips, the network's own, with those of PACE_LABELS held by none; `paces` of its
+        frames, as `follow_paces` finds them, if these are labels."""
         mean, std = compute_feature_statistics(corpus.features)
         super().__init__(settings, lambda: LstmGmm(config, mean=mean, std=std))
-        self.config, self.labels = config, labels or Labels.none(len(corpus.lengths))
-        self._frame_labels = [
-            ([self.labels.names.index(name) for name in names], frames)
-            for names, frames in (frame_labels or {}).items()
-        ]
+        self.config, self.labels, self.paces = config, labels or Labels.none(len(corpus.lengths)), paces
+        self._pace_labels = [] if paces is None else [self.labels.names.index(name) for name in PACE_LABELS]
         self.clip_ends = torch.tensor(corpus.lengths).cumsum(0)
         self.windows = FeatureWindows(corpus, settings.window + 1, standing_share=settings.standing_share)
         self._latest = corpus.features[:0], self.labels.held[:0]  # windows of the step under way, and their labels
@@ -304,17 +285,15 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
             critic_trainer.learn(self.step, _CRITIC_HEAD_START, self.generator)
 
     def _run_free(self, windows: Tensor, shown: Tensor) -> tuple[Tensor, Tensor]:
-        """Free runs after the first windows, given their frames' labels as the network is in this step, and how these
-        go on.
+        """Free runs after the first windows, given their paces as the network is in this step, and how these go on.
 
         A pace may change within a window. Gait and style last, and runs have them from the frames they begin with:
         given them as well, a density of walks was no better.
         """
         windows, shown = windows[:_FREE_RUNS], shown[:_FREE_RUNS]
-        of_frames = torch.zeros_like(shown)
-        for columns, _ in self._frame_labels:
-            of_frames[:, columns] = shown[:, columns]
-        condition = self._make_condition(shown.new_zeros(len(shown), 1), of_frames)
+        paces = torch.zeros_like(shown)
+        paces[:, self._pace_labels] = shown[:, self._pace_labels]
+        condition = self._make_condition(shown.new_zeros(len(shown), 1), paces)
         least = SEEN_FRAMES if self.critic_trainer is not None else 0
         return run_free(self.network, windows, self.generator, least=least, condition=condition)
 
@@ -344,10 +323,11 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         """Windows of clips with the labels that the network is shown."""
         drawn = self.windows.draw(self.settings.batch, self.generator)
         labels = self.labels.held[torch.searchsorted(self.clip_ends, drawn.first, right=True)]
-        for columns, frames in self._frame_labels:
-            # How a window ends: given a pace that is not yet its own, the network changes to it within a window.
-            labels[:, columns] = one_hot(frames[drawn.first + self.settings.window], len(columns)).to(labels.dtype)
         labels = torch.where(drawn.mirrored[:, None], labels[:, self.labels.mirrored], labels)
+        if self.paces is not None:
+            # How a window ends: given a pace that is not yet its own, the network changes to it within a window.
+            ends = self.paces[drawn.first + self.settings.window]
+            labels[:, self._pace_labels] = one_hot(ends, len(PACE_LABELS)).to(labels.dtype)
         if not self.labels.names:
             return drawn.features, labels
         # Mostly no label or one group only, so that the network works with any subset of labels.
