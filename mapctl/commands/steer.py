@@ -184,8 +184,7 @@ def _run_steering(
     generator = torch.Generator().manual_seed(command.seed)
     state, pose = steer.begin(prior, first, generator=generator, settings=settings, skeleton=character.skeleton)
     recorder.show(pose, 0.0)
-    for wanted in (first, *{wanted.labels: wanted for wanted in track.commands}.values()):
-        steer.step(state, wanted)  # compiling, loading and conditioning on first use must not cost frames
+    steer.warm_up(state, {wanted.labels: wanted for wanted in track.commands}.values(), stepper=stepper)
     clock = WallClock() if command.realtime else StreamClock()
     with show_progress("steering", quiet=command.quiet) as progress:
         displays: list[Display] = [recorder.show]
