@@ -407,13 +407,13 @@ def warm_up(state: SteerState, commands: Iterable[Command], *, stepper: Stepper 
 def save(state: SteerState) -> bytes:
     """Pickle a state without its prior, about 50 kB; work on an arrival is finished first. With its prior, and whole,
     a state can be pickled and copied as any value."""
-    return pickle.dumps(replace(state, prior=None))  # pyright: ignore[reportArgumentType]
+    return pickle.dumps({name: value for name, value in vars(state).items() if name != "prior"})
 
 
 def restore(saved: bytes, prior: Density) -> SteerState:
     """Return a saved state, with the same prior: it goes on to the bit as the one that was saved. As with any pickle,
     only bytes of your own."""
-    return replace(pickle.loads(saved), prior=prior)  # noqa: S301
+    return SteerState(prior, **pickle.loads(saved))  # noqa: S301
 
 
 def _lead_around(state: SteerState, command: Command) -> Command:
