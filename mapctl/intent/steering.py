@@ -18,8 +18,6 @@ from itertools import accumulate, pairwise
 from os import PathLike
 from pathlib import Path
 
-import torch
-
 from mapctl import formats
 from mapctl.arguments import read_names, read_number, read_point
 from mapctl.curves.obstacles import Obstacle
@@ -77,13 +75,15 @@ class Arrival:
             raise RequestError(f"the pose of an arrival must be a Motion, got {type(self.pose).__name__}")
 
     def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Arrival) or (self.pose is None) is not (other.pose is None):
-            return False
-        same = (self.position, self.by, self.facing) == (other.position, other.by, other.facing)
-        return same and (self.pose is other.pose or _holds_same_pose(self.pose, other.pose))
+        return isinstance(other, Arrival) and self._values == other._values
 
     def __hash__(self) -> int:
         return hash((self.position, self.by, self.facing))
+
+    @property
+    def _values(self) -> tuple[object, ...]:
+        pose = self.pose and (self.pose.root_position.tolist(), self.pose.local_quat_xyzw.tolist())
+        return self.position, self.by, self.facing, pose
 
 
 @dataclass(frozen=True)
@@ -219,11 +219,6 @@ def _read_numbers(holder: object, names: Sequence[str], *, optional: Sequence[st
     for name in (*names, *optional):
         if (value := getattr(holder, name)) is not None or name in names:
             object.__setattr__(holder, name, read_number(value, name))
-
-
-def _holds_same_pose(one: Motion, other: Motion) -> bool:
-    pairs = (one.root_position, other.root_position), (one.local_quat_xyzw, other.local_quat_xyzw)
-    return all(torch.equal(mine, theirs) for mine, theirs in pairs)
 
 
 def _wrap_whole_turns(angle: float | None) -> float | None:
