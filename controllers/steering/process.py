@@ -217,9 +217,9 @@ class ProcessClock(WallClock):
             frames.steering_targets[-1].velocity,
             spare,
             frames.seconds,
-            tuple(self._notes),
             frames.root_velocity.numpy(),
             frames.trajectory.numpy(),
+            tuple(self._notes),
         )
         self._connection.send(("frames", chunk))
         self._held = 0.0

@@ -1,11 +1,10 @@
 """Protocol between a character that is steered live and its viewer; neither imports the other."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Protocol, runtime_checkable
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from numpy import ndarray
@@ -39,12 +38,12 @@ class FrameChunk:
     came very late are due anew, as soon as they are there."""
     compute_seconds: float
     """Compute time of the step, seconds."""
+    root_velocity: Float[ndarray, "frames 2"]
+    """Velocity of the hips over the ground, x and z, m/s."""
+    trajectory: Float[ndarray, "points 3"]
+    """Ground trajectory of the forecast frames: x and z of the hips, metres, and their heading, radians."""
     notes: tuple[str, ...] = ()
     """Notes on commands since the last step that could not be obeyed, or not as given."""
-    root_velocity: Float[ndarray, "frames 2"] = field(default_factory=lambda: np.zeros((0, 2)))
-    """Velocity of the hips over the ground, x and z, m/s."""
-    trajectory: Float[ndarray, "ahead 3"] = field(default_factory=lambda: np.zeros((0, 3)))
-    """Ground trajectory of the forecast frames: x and z of the hips, metres, and their heading, radians."""
 
     def due_of(self, frame: int) -> float:
         """Return the value of time.perf_counter, seconds, at which a frame is to be seen."""
