@@ -12,9 +12,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from mapctl import kinematics, rotations
+from mapctl.arguments import read_number
 from mapctl.errors import MapctlError, RequestError
 from mapctl.skeleton import Skeleton, mirror_name
 
+_MOST_ROTATIONS = 50_000_000  # of a resampled motion: some gigabytes while they are interpolated
 _CHORD_SECONDS = 0.5  # between the frames whose distances are added up: sway and noise count little
 
 
@@ -133,28 +135,35 @@ class Motion:
     def resample(self, fps: Fraction | float) -> "Motion":
         """Resample the motion to another frame rate: positions linear, rotations slerp; the first frame stays.
 
-        Going down, a short moving average would blur contacts, so frames are interpolated, not filtered.
+        Going down, a short moving average would blur contacts, so frames are interpolated, not filtered. RequestError
+        for a rate that needs more memory than a machine has.
         """
-        fps = Fraction(fps).limit_denominator(100_000)
+        exact = fps if isinstance(fps, Fraction) else Fraction(read_number(fps, "the frame rate"))
+        fps = exact.limit_denominator(100_000)
         if fps <= 0:
-            raise RequestError(f"the frame rate must be positive, got {float(fps):g}")
+            raise RequestError(f"the frame rate must be positive, got {float(exact):g}")
         if fps == self.fps:
             return self
         count = int((self.num_frames - 1) * fps / self.fps) + 1
-        at = torch.arange(count, dtype=torch.float64) * float(self.fps / fps)
-        low = at.floor().long().clamp(max=self.num_frames - 1)
-        high, weight = (low + 1).clamp(max=self.num_frames - 1), at - low
+        if count > self.num_frames and count * self.num_joints > _MOST_ROTATIONS:
+            raise RequestError(f"a frame rate of {float(fps):g} would give {count} frames, too many for memory")
+        return replace(self.sample(torch.arange(count, dtype=torch.float64) * float(self.fps / fps)), fps=fps)
+
+    def sample(self, frames: Float[Tensor, " sampled"]) -> "Motion":
+        """Return the poses at these frames or between them (2.5 is halfway from frame 2 to 3): positions linear,
+        rotations slerp. Before the first frame and after the last one the motion stands still."""
+        at = frames.clamp(0, self.num_frames - 1)
+        low = at.floor().long()
+        high, weight = (low + 1).clamp(max=self.num_frames - 1), (at - low).unsqueeze(-1)
 
         def linear(values: Tensor) -> Tensor:
-            return torch.lerp(values[low], values[high], weight.unsqueeze(-1))
+            return torch.lerp(values[low], values[high], weight)
 
         quat = self.local_quat_xyzw
-        joint_weight = weight.unsqueeze(-1).expand(count, self.num_joints)
         return replace(
             self,
-            fps=fps,
             root_position=linear(self.root_position),
-            local_quat_xyzw=rotations.slerp(quat[low], quat[high], joint_weight),
+            local_quat_xyzw=rotations.slerp(quat[low], quat[high], weight.expand(-1, self.num_joints)),
             moving_offsets={j: linear(v) for j, v in self.moving_offsets.items()},
         )
 

@@ -9,7 +9,7 @@ import os
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Generic, TypeVar
@@ -110,6 +110,10 @@ class LoadedModel:
     """Name, file or run folder by which it was requested."""
     card: Card
     """Card of the weights."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the fields alone for a pickle or a copy, which computes again what is cached."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}  # pyright: ignore[reportArgumentType]
 
     def __str__(self) -> str:
         return f"{type(self).__name__}: {self.name}, {self.card.licence or 'without a licence'}"

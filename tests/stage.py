@@ -27,6 +27,8 @@ def delivered(first: int = 0, count: int = 3, *, spare: float = 0.02) -> FrameCh
         (0.0, 1.2),
         spare,
         0.05,
+        np.zeros((count, 2)),
+        np.zeros((0, 3)),
     )
 
 

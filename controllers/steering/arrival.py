@@ -78,7 +78,6 @@ def commit_frames(state: SteerState, new: Float[Tensor, "frames size"]) -> Commi
         features=torch.cat([committed.features, new]),
         joints_world=joints[-_JUDGED_FRAMES:],
         warm_start=committed.warm_start[:0],
-        forecast=None,
     ).discard_history(KEPT_FRAMES)
 
 
@@ -106,7 +105,7 @@ def plan_stitch(
     found = yield from transitions.connect(
         state.committed.features, after, seen.expand(count, -1), turn.expand(count), frames
     )
-    return found[int(_measure_roughness(state, found).argmin())]
+    return found[int(_measure_roughness(state, found).argmin())].clone()  # a view would keep, and pickle, all of them
 
 
 def _pose_candidates(state: SteerState, command: Command, order: Arrival) -> Float[Tensor, "batch after size"]:
@@ -157,7 +156,8 @@ class Arriver:
         if order is None:
             return step(replace(state, approach=Approach(None, plain)), plain, seconds=seconds)
         left = round(order.by * PRIOR_FPS) - state.frames + 1
-        old, new = approach, approach is None or approach.order is not order
+        condition_prior(state.prior, command.labels)  # unknown labels are refused now, not where they first matter
+        old, new = approach, approach is None or approach.order != order
         if approach is None or new:
             refusal = _refuse(state, order, left)
             before = approach.held if approach and refusal else plain
@@ -256,10 +256,8 @@ def _deliver(state: SteerState, approach: Approach, command: Command) -> tuple[S
     planned, start = approach.planned, state.committed.ground_pose
     assert planned is not None
     new, rest = planned[: state.settings.commit], planned[state.settings.commit :]
-    after, forecast = commit_frames(state, new), None
-    if len(rest):
-        forecast = decode(rest, after.ground_pose, skeleton=state.character.unit_skeleton).joint_positions()
-    state, frames = deliver(state, after, new, _read_targets(new, start, state.target), command, forecast)
+    after = commit_frames(state, new)
+    state, frames = deliver(state, after, new, _read_targets(new, start, state.target), command, rest)
     return replace(state, approach=replace(approach, planned=rest)), frames
 
 

@@ -20,7 +20,8 @@ from typing import TypeAlias
 import numpy as np
 import torch
 
-from controllers.steering.steer import Refusal, SteerFrames, SteerState, step
+from controllers.steering.steer import Refusal, SteerFrames, SteerState, Stepper, step
+from mapctl.arguments import read_number
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.steering import Command, SteeringTarget
@@ -31,10 +32,6 @@ from mapctl.rotations import make_sign_continuous
 _MARGIN, _MOST_MARGIN = 0.015, 0.05  # seconds before frames are due at which a step is to end, for the display
 _MARGIN_USED, _MARGIN_RISE, _MARGIN_FALL = 0.75, 1.5, 0.997  # found within a second, and forgotten within a minute
 _SLACK = 0.1  # seconds by which frames may be late before time is held for them; less is caught up by searching less
-
-Stepper: TypeAlias = Callable[..., tuple[SteerState, SteerFrames]]
-"""(state, command, seconds=...) to the next state and frames, as `controllers.steering.steer.step`."""
-
 
 Source: TypeAlias = Callable[[float], Command]
 """Seconds of the stream to the command that holds then: a script's `at`, a joystick, a web page."""
@@ -150,6 +147,37 @@ class Recorder:
     def ledger(self) -> Ledger:
         """Ledger of all solved frames."""
         return reduce(Ledger.join, (piece.ledger for piece in self.pieces if piece.ledger.entries), Ledger())
+
+
+_KEPT_FRAMES = 30  # delivered frames that can still be asked for: an engine shows a step while the next is solved
+
+
+class Playback:
+    """The pose at any time of the stream, for an engine of any frame rate: a display, `show`, and `at`."""
+
+    def __init__(self):
+        self._first = 0  # index of the first kept frame
+        self._delivered: Motion | None = None
+        self._whole: Motion | None = None  # with the forecast after it
+
+    def show(self, frames: SteerFrames, due: float) -> None:
+        """Keep frames, the first of them `due` at that second of the stream, and their forecast. Frames that were kept
+        from there on are forgotten: they were rolled back."""
+        start, motion = round(due * PRIOR_FPS), frames.motion
+        kept = 0 if self._delivered is None else min(self._delivered.num_frames, start - self._first)
+        if self._delivered is not None and kept > 0 and self._first + kept == start:
+            first = max(0, kept - _KEPT_FRAMES)
+            motion, start = self._delivered.slice(first, kept).join(motion), self._first + first
+        self._first, self._delivered = start, motion
+        self._whole = motion if frames.ahead is None else motion.join(frames.ahead)
+
+    def at(self, seconds: float) -> Motion:
+        """Return the pose at a second of the stream, a motion of one frame: between delivered frames, or between those
+        of the forecast where no more are delivered; at its end it stands still."""
+        if self._whole is None:
+            raise RequestError("nothing was shown")
+        frame = PRIOR_FPS * read_number(seconds, "the second of a pose") - self._first
+        return self._whole.sample(torch.tensor([frame], dtype=torch.float64))
 
 
 def find_second_zero(clock: StreamClock, state: SteerState) -> float:

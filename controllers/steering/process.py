@@ -143,7 +143,6 @@ class Autopilot:
         return replace(led, speed=min(led.speed, math.sqrt(2 * self._limits.braking * (left - _ARRIVAL_DISTANCE))))
 
 
-_WARM_UP_STEPS = 3  # steps before the clock starts, which compile and load what is needed
 _TURN = 0.618034  # share of a step between processes one after the other: multiples of the golden ratio spread evenly
 
 
@@ -218,6 +217,8 @@ class ProcessClock(WallClock):
             frames.steering_targets[-1].velocity,
             spare,
             frames.seconds,
+            frames.root_velocity.numpy(),
+            frames.trajectory.numpy(),
             tuple(self._notes),
         )
         self._connection.send(("frames", chunk))
@@ -294,10 +295,8 @@ def _run_character(connection: Connection, request: CharacterRequest) -> None:
             prior, first, generator=generator, at=request.at, settings=request.settings, skeleton=request.skeleton
         )
         if number == 0:
-            for _ in range(_WARM_UP_STEPS):
-                steer.step(state, first)
-            if transitions is not None:
-                Arriver(transitions)(state, replace(first, arrival=Arrival((0.0, 0.0), 1.0)))
+            arrival = None if transitions is None else Arrival(request.at, 1.0)
+            steer.warm_up(state, [first, replace(first, arrival=arrival)], stepper=stepper)
             connection.send(("ready", None))
         _wait_for_turn(request.settings.commit / PRIOR_FPS)
         clock.begin(state, pose)

@@ -7,10 +7,12 @@ that are known in advance, `controllers.shots.trajectory` finds the shortest det
 """
 
 import math
+import pickle
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import TypeAlias
 
 import torch
 from jaxtyping import Float
@@ -20,10 +22,12 @@ from controllers.common.character import Character
 from controllers.common.initial_state import start_from_state
 from controllers.steering.overlay import Overlay
 from mapctl import rotations
+from mapctl.arguments import read_number, read_point
 from mapctl.curves.obstacles import Obstacle, measure_clearance
-from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed
-from mapctl.intent.steering import Arrival, Command, SteeringLimits, SteeringTarget
-from mapctl.pose import decode
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed, integrate_root
+from mapctl.intent.steering import STEP_LENGTHS, Arrival, Command, SteeringLimits, SteeringTarget
+from mapctl.motion import Motion
+from mapctl.pose import BodyPose, decode
 from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver
 from mapctl.problem.solution import Ledger, Outcome, Solution, Status
 from mapctl.problem.unknowns import WindowRequest
@@ -220,14 +224,30 @@ class SteerFrames(Solution):
 
     contacts: Float[Tensor, "frames 2"]
     """Contacts of the left and the right toe, 1 or 0."""
+    root_velocity: Float[Tensor, "frames 2"]
+    """Velocity of the hips over the ground, x and z in the world, m/s."""
     steering_targets: tuple[SteeringTarget, ...]
     """Steering targets of the frames."""
     forecast: Float[Tensor, "ahead joints 3"]
     """World joint positions of the frames that would come next, metres; the next command changes them."""
+    ahead: Motion | None = None
+    """Poses of those frames, without reaches; None with the first pose."""
     evaluations: int = 0
     """Energy-and-gradient evaluations of the step."""
     refusal: Refusal | None = None
     """An order to be somewhere that is not obeyed; given once."""
+
+    @property
+    def trajectory(self) -> Float[Tensor, "ahead 3"]:
+        """Ground trajectory of the forecast: x and z of the hips, metres, and their heading, radians, not wrapped."""
+        if self.ahead is None:
+            return torch.zeros(0, 3)
+        pose = BodyPose.of_motion(self.ahead)
+        return torch.cat([pose.root_position[:, ::2], pose.heading[:, None]], dim=1)
+
+
+Stepper: TypeAlias = Callable[..., tuple[SteerState, SteerFrames]]
+"""(state, command, seconds=...) to the next state and frames: `step`, or a `controllers.steering.arrival.Arriver`."""
 
 
 def begin(
@@ -248,14 +268,15 @@ def begin(
     toes' rest height is that of `settings.footing`; commands, limits and delivered frames are in its metres.
     """
     chosen = settings or SteerSettings()
-    character = Character(skeleton, chosen.footing.rest_height)
+    character, position = Character(skeleton, chosen.footing.rest_height), read_point(at, 2, "the first position")
     command = character.command(command)
     starts = condition_prior(prior, command.labels).initial_states
     nearest = (starts.speed - command.speed).abs().argsort()[:_NEAREST_STARTS]
     pick = int(nearest[torch.randint(len(nearest), (1,), generator=generator)])
     state = starts.state.pick(torch.tensor([pick]))
     ground_pose = GroundPose(
-        torch.tensor(at, dtype=torch.float32) / character.scale, torch.tensor(command.heading, dtype=torch.float32)
+        torch.tensor(position, dtype=torch.float32) / character.scale,
+        torch.tensor(command.heading, dtype=torch.float32),
     )
     start = start_from_state(state, ground_pose, character.unit_skeleton)
     first = start.committed.features
@@ -266,6 +287,7 @@ def begin(
         Status(Outcome.DONE),
         Ledger(),
         contacts=LAYOUT.pick(first, "contacts"),
+        root_velocity=_ground_velocity(first, start.before_first) * character.scale,
         steering_targets=(character.target(target),),
         forecast=start.committed.joints_world[:0],
     )
@@ -287,11 +309,13 @@ def accept(prior: Density, command: Command) -> tuple[Command, list[str]]:
 def step(state: SteerState, command: Command, *, seconds: float | None = None) -> tuple[SteerState, SteerFrames]:
     """Solve the next frames under a command, but for its arrival (see `controllers.steering.arrival`). Within `seconds`
     the best solution so far is returned, with a note; without an evaluation where there is no time for one: then the
-    last plan is carried on. What must be done in any case takes about 4 ms.
+    last plan is carried on. What must be done in any case takes about 4 ms. Without a limit of time, the budget is
+    `SteerSettings.evaluations`, and the same state and command give the same frames to the bit.
 
-    RequestError for labels that the prior does not know. The first step under new labels takes longer.
+    RequestError for labels that the prior does not know. The first step under new labels takes longer (`warm_up`).
     """
     began, settings, character = time.perf_counter(), state.settings, state.character
+    seconds = None if seconds is None else read_number(seconds, "the seconds of a step")
     asked, command = command, character.command(_lead_around(state, command))
     stuck = _velocity_error(state) > settings.stuck
     if stuck:
@@ -306,15 +330,15 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
     search = None if seconds is None else max(0.0, seconds - state.cost.rest)
     done, outcome = _solve_step(conditioned, terms, search, free=free)
     if outcome is not Outcome.DONE:
-        cold = replace(state.committed, warm_start=state.committed.warm_start[:0], forecast=None)
+        cold = replace(state.committed, warm_start=state.committed.warm_start[:0])
         restarted = replace(conditioned, committed=cold)
         done, _ = _solve_step(restarted, terms, 0.0, free=False)  # the prior's own continuation, which always exists
     new, record = done.features[-settings.commit :], done.windows[-1]
     cut_short = record.outcome == LbfgsStatus.OUT_OF_BUDGET.value and record.evaluations < settings.evaluations
     note = f"the deadline came after {record.evaluations} of {settings.evaluations} evaluations"
     status = Status(Outcome.BUDGET, (note,)) if cut_short else Status(Outcome.DONE)
-    committed, forecast = done.discard_history(max(len(new), KEPT_FRAMES)), done.forecast
-    after, frames = deliver(state, committed, new, targets[: settings.commit], asked, forecast)
+    committed = done.discard_history(max(len(new), KEPT_FRAMES))
+    after, frames = deliver(state, committed, new, targets[: settings.commit], asked, done.ahead, done.forecast)
     ledger, spent = character.ledger(done.ledger), time.perf_counter() - began
     cost = state.cost.learn(spent, record.evaluations, search=search, cut_short=cut_short)
     return replace(after, cost=cost), replace(
@@ -328,22 +352,29 @@ def deliver(
     new: Float[Tensor, "frames size"],
     targets: Sequence[SteeringTarget],
     command: Command,
-    forecast: Float[Tensor, "ahead joints 3"] | None,
+    ahead: Float[Tensor, "ahead size"] | None,
+    joints: Float[Tensor, "ahead joints 3"] | None = None,
 ) -> tuple[SteerState, SteerFrames]:
     """Return the state after new frames, with what is committed then and their targets, and the frames as they are
-    shown, with the forecast of those after them, all at the prior's size."""
-    character = state.character
-    ahead = (committed.joints_world[:0] if forecast is None else forecast) * character.scale
-    motion = character.motion(decode(new, state.committed.ground_pose, skeleton=character.unit_skeleton))
-    overlay, motion = state.overlay.pose(motion, command, ahead)
+    shown, with the forecast of those after them, all at the prior's size: features and, where they are known, world
+    joints."""
+    character, start = state.character, state.committed.ground_pose
+    motion = character.motion(decode(new, start, skeleton=character.unit_skeleton))
+    forecast, following = committed.joints_world[:0], None
+    if ahead is not None and len(ahead):
+        following = character.motion(decode(ahead, committed.ground_pose, skeleton=character.unit_skeleton))
+        forecast = following.joint_positions() if joints is None else joints * character.scale
+    overlay, motion = state.overlay.pose(motion, command, forecast)
     frames = SteerFrames(
         motion,
         Status(Outcome.DONE),
         Ledger(),
         features=new,
         contacts=LAYOUT.pick(new, "contacts"),
+        root_velocity=_ground_velocity(new, start) * character.scale,
         steering_targets=tuple(map(character.target, targets)),
-        forecast=ahead,
+        forecast=forecast,
+        ahead=following,
     )
     velocities = torch.tensor([target.velocity for target in targets])
     next_state = replace(
@@ -355,6 +386,34 @@ def deliver(
         overlay=overlay,
     )
     return next_state, frames
+
+
+def _ground_velocity(features: Float[Tensor, "frames size"], start: GroundPose) -> Float[Tensor, "frames 2"]:
+    """Compute the velocity of the hips over the ground in each frame after a ground pose, m/s at the prior's size."""
+    ground, _ = integrate_root(features, start)
+    return torch.cat([start.position_xz[None], ground]).diff(dim=0) * PRIOR_FPS
+
+
+def warm_up(state: SteerState, commands: Iterable[Command], *, stepper: Stepper | None = None) -> None:
+    """Compile, load and condition what steps under commands like these need on first use, for seconds, so that none of
+    a game's does. The state stays as it is. One command for each set of labels is enough; `stepper` as in the loop."""
+    # With a step length, and as a stuck character, a step has a term and a search of its own.
+    stuck = replace(state, settings=replace(state.settings, stuck=-1.0))
+    for command in commands:
+        (stepper or step)(state, command)
+        step(stuck, replace(command, step_length=command.step_length or STEP_LENGTHS[0] * state.character.scale))
+
+
+def save(state: SteerState) -> bytes:
+    """Pickle a state without its prior, about 50 kB; work on an arrival is finished first. With its prior, and whole,
+    a state can be pickled and copied as any value."""
+    return pickle.dumps({name: value for name, value in vars(state).items() if name != "prior"})
+
+
+def restore(saved: bytes, prior: Density) -> SteerState:
+    """Return a saved state, with the same prior: it goes on to the bit as the one that was saved. As with any pickle,
+    only bytes of your own."""
+    return SteerState(prior, **pickle.loads(saved))  # noqa: S301
 
 
 def _lead_around(state: SteerState, command: Command) -> Command:

@@ -41,5 +41,5 @@ def _use_kernels() -> None:
     follow(prior, curves.line(length=1.0), seconds=0.1)
     ahead = Command(1.0, 0.0)
     state, _ = steer.begin(prior, ahead, generator=generator)
-    steer.step(state, ahead)
+    steer.warm_up(state, [ahead])
     prior.sample(prior.initial_states.state.pick(torch.tensor([0])), 1, generator)

@@ -184,8 +184,7 @@ def _run_steering(
     generator = torch.Generator().manual_seed(command.seed)
     state, pose = steer.begin(prior, first, generator=generator, settings=settings, skeleton=character.skeleton)
     recorder.show(pose, 0.0)
-    for wanted in (first, *{wanted.labels: wanted for wanted in track.commands}.values()):
-        steer.step(state, wanted)  # compiling, loading and conditioning on first use must not cost frames
+    steer.warm_up(state, {wanted.labels: wanted for wanted in track.commands}.values(), stepper=stepper)
     clock = WallClock() if command.realtime else StreamClock()
     with show_progress("steering", quiet=command.quiet) as progress:
         displays: list[Display] = [recorder.show]
@@ -202,12 +201,16 @@ def _run_steering(
 
 def _stream_to(stream: "PoseStream", clock: WallClock, frames: int, zero: float) -> Display:
     """Build the display that has a script's frames sent when they are due; `zero` is the clock's time at second 0."""
+    from mapctl.streaming.sender import guide
 
     def show(new: SteerFrames, due: float) -> None:
         left = frames - round(due * float(new.motion.fps))
         if left > 0:
-            root, quats = new.motion.root_position[:left], new.motion.local_quat_xyzw[:left]
-            stream.put(0, clock.perf_counter_at(zero + due), due, root.numpy(), quats.numpy())
+            motion, trajectory = new.motion, new.trajectory.numpy()
+            parts = motion.root_position, motion.local_quat_xyzw, new.contacts, new.root_velocity
+            root, quats, contacts, velocity = (part[:left].numpy() for part in parts)
+            guidance = guide(root, quats, contacts, velocity, trajectory)
+            stream.put(0, clock.perf_counter_at(zero + due), due, root, quats, guidance)
 
     return show
 

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mapctl.arguments import read_number, read_point
 from mapctl.errors import RequestError
 
 
@@ -26,8 +27,14 @@ class Obstacle:
     def __post_init__(self):
         if (self.radius is None) == (self.size is None):
             raise RequestError("an obstacle has a radius or a size, one of them")
-        lengths = (self.radius,) if self.size is None else self.size
-        if not all(length is not None and 0 < length < math.inf for length in lengths):
+        object.__setattr__(self, "place", read_point(self.place, 2, "the position of an obstacle"))
+        if self.size is None:
+            lengths = (read_number(self.radius, "the radius of an obstacle"),)
+            object.__setattr__(self, "radius", lengths[0])
+        else:
+            lengths = read_point(self.size, 2, "the size of an obstacle")
+            object.__setattr__(self, "size", lengths)
+        if min(lengths) <= 0:
             raise RequestError(f"lengths of an obstacle must be positive, got {lengths}")
 
     @staticmethod

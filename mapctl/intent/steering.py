@@ -11,13 +11,15 @@ no label, and reaches for nothing and looks at nothing in particular.
 
 import math
 from bisect import bisect_right
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import accumulate, pairwise
 from os import PathLike
 from pathlib import Path
 
 from mapctl import formats
+from mapctl.arguments import read_names, read_number, read_point
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import FileFormatError, MapctlError, RequestError
 from mapctl.formats.text import finite_number, read_table, shorten
@@ -38,8 +40,10 @@ class SteeringLimits:
     (`DataLimits.turn_rate`): a reversal has to be faster."""
 
     def __post_init__(self):
-        for name in ("acceleration", "braking", "turn_rate"):
-            if not 0 < getattr(self, name) < math.inf:
+        names = ("acceleration", "braking", "turn_rate")
+        _read_numbers(self, names)
+        for name in names:
+            if getattr(self, name) <= 0:
                 raise RequestError(f"{name} must be positive, got {getattr(self, name):g}")
 
 
@@ -52,7 +56,8 @@ at 1.2 m/s, planted toes move 1 to 4 cm/s within, 9 for steps of 2.5 m, and for 
 
 @dataclass(frozen=True, eq=False)
 class Arrival:
-    """An order to be somewhere at a time."""
+    """An order to be somewhere at a time; equal to another with the same values, so that it may be built anew at every
+    step."""
 
     position: tuple[float, float]
     """Where the hips are to be over the ground, x and z, metres."""
@@ -64,8 +69,21 @@ class Arrival:
     """Pose there, a canonical motion of one frame; None walks on, or stands where the command's speed is 0."""
 
     def __post_init__(self):
-        if not all(map(math.isfinite, (*self.position, self.by, self.facing or 0.0))):
-            raise RequestError("the position, the time and the facing of an arrival are finite numbers")
+        object.__setattr__(self, "position", read_point(self.position, 2, "the position of an arrival"))
+        _read_numbers(self, ("by",), optional=("facing",))
+        if self.pose is not None and not isinstance(self.pose, Motion):
+            raise RequestError(f"the pose of an arrival must be a Motion, got {type(self.pose).__name__}")
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Arrival) and self._values == other._values
+
+    def __hash__(self) -> int:
+        return hash((self.position, self.by, self.facing))
+
+    @property
+    def _values(self) -> tuple[object, ...]:
+        pose = self.pose and (self.pose.root_position.tolist(), self.pose.local_quat_xyzw.tolist())
+        return self.position, self.by, self.facing, pose
 
 
 @dataclass(frozen=True)
@@ -96,19 +114,24 @@ class Command:
     """Where to be first, and when; the rest of the command holds from then on."""
 
     def __post_init__(self):
-        if not (math.isfinite(self.speed) and self.speed >= 0):
-            raise RequestError(f"a command's speed must be a number of m/s, 0 or more, got {self.speed:g}")
-        if self.step_length is not None and not 0 < self.step_length < math.inf:
+        _read_numbers(self, ("speed", "heading"), optional=("facing", "turning", "step_length"))
+        if self.speed < 0:
+            raise RequestError(f"a command's speed must be 0 m/s or more, got {self.speed:g}")
+        if self.step_length is not None and self.step_length <= 0:
             raise RequestError(f"a command's step length must be positive, got {self.step_length:g} m")
-        for name in ("heading", "facing", "turning"):
-            value = getattr(self, name)
-            if value is not None and not math.isfinite(value):
-                raise RequestError(f"a command's {name} must be a finite angle, got {value:g}")
-        for name, position in {**self.reach, **({} if self.look_at is None else {"look_at": self.look_at})}.items():
-            if name not in (*REACHING_HANDS, "look_at"):
-                raise RequestError(f"a command reaches with {' or '.join(REACHING_HANDS)}, not with {name}")
-            if len(position) != 3 or not all(map(math.isfinite, position)):
-                raise RequestError(f"the position for {name} must be three finite numbers of metres, got {position}")
+        if not isinstance(self.reach, Mapping) or not {*self.reach} <= {*REACHING_HANDS}:
+            wrong = ", ".join(map(str, self.reach)) if isinstance(self.reach, Mapping) else self.reach
+            raise RequestError(f"a command reaches with {' or '.join(REACHING_HANDS)}, not with {wrong}")
+        keep = partial(object.__setattr__, self)
+        keep("reach", {name: read_point(point, 3, f"the position for {name}") for name, point in self.reach.items()})
+        if self.look_at is not None:
+            keep("look_at", read_point(self.look_at, 3, "the position for look_at"))
+        keep("labels", read_names(self.labels, "a command's labels"))
+        keep("obstacles", tuple(self.obstacles) if isinstance(self.obstacles, Iterable) else (None,))
+        if not all(isinstance(each, Obstacle) for each in self.obstacles):
+            raise RequestError("a command's obstacles must be a sequence of Obstacle")
+        if not isinstance(self.arrival, Arrival | None):
+            raise RequestError("a command's arrival must be an Arrival")
 
     @property
     def hips_heading(self) -> float:
@@ -194,6 +217,13 @@ class SteeringTarget:
         """Return the targets of the next frames if the command stays."""
         steps = accumulate(range(frames), lambda target, _: target.step_toward(command, limits, 1 / fps), initial=self)
         return list(steps)[1:]
+
+
+def _read_numbers(holder: object, names: Sequence[str], *, optional: Sequence[str] = ()) -> None:
+    """Turn these attributes into finite floats, the optional ones where they are not None."""
+    for name in (*names, *optional):
+        if (value := getattr(holder, name)) is not None or name in names:
+            object.__setattr__(holder, name, read_number(value, name))
 
 
 def _wrap_whole_turns(angle: float | None) -> float | None:

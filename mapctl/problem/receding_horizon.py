@@ -4,6 +4,7 @@ advances a prior's state during a solve.
 """
 
 import math
+import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -22,6 +23,10 @@ from mapctl.protocols import AnyDensity, DensityState
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.terms.base import Term
 from mapctl.terms.trial import Trial
+
+if hasattr(os, "register_at_fork"):
+    # The threads that torch began do not survive a fork: a child that counted on them would wait for ever.
+    os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
 TermsOf = Callable[[int, int], Sequence[Term]]
 """(first frame, number of frames) of a window to its terms."""
@@ -73,15 +78,16 @@ class CommittedFrames:
     """Record of each window, its cost among them."""
     forecast: Float[Tensor, "ahead joints 3"] | None = None
     """World joint positions of the last window's look-ahead, metres."""
+    ahead: Float[Tensor, "ahead size"] | None = None
+    """Features of that look-ahead."""
     discarded: int = 0
     """Number of committed frames before the first of `features`, which are no longer kept."""
 
     def discard_history(self, keep: int) -> "CommittedFrames":
-        """Return this with the features of the last `keep` frames only, and without ledger and records."""
+        """Return this with the features of the last `keep` frames only, and without ledger, records and look-ahead."""
         gone = max(0, len(self.features) - keep)
-        return replace(
-            self, features=self.features[gone:], ledger=Ledger(), windows=(), discarded=self.discarded + gone
-        )
+        kept = replace(self, features=self.features[gone:], discarded=self.discarded + gone)
+        return replace(kept, ledger=Ledger(), windows=(), forecast=None, ahead=None)
 
     @property
     def contacts(self) -> Bool[Tensor, "2"]:
@@ -197,6 +203,7 @@ class RecedingHorizonSolver:
             ledger=done.ledger.join(window.ledger.slice(count)),
             windows=(*done.windows, record),
             forecast=window.trial.joints_world[0, count:],
+            ahead=window.trial.features[0, count:],
             discarded=done.discarded,
         )
 

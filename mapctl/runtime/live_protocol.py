@@ -38,6 +38,10 @@ class FrameChunk:
     came very late are due anew, as soon as they are there."""
     compute_seconds: float
     """Compute time of the step, seconds."""
+    root_velocity: Float[ndarray, "frames 2"]
+    """Velocity of the hips over the ground, x and z, m/s."""
+    trajectory: Float[ndarray, "points 3"]
+    """Ground trajectory of the forecast frames: x and z of the hips, metres, and their heading, radians."""
     notes: tuple[str, ...] = ()
     """Notes on commands since the last step that could not be obeyed, or not as given."""
 

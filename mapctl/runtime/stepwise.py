@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Generator
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 Result = TypeVar("Result")
 
@@ -26,6 +26,10 @@ class StepwiseWork(Generic[Result]):
         while not self._result:
             self._step()
         return self._result[0]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Finish the work, so that it can be pickled and copied, which a generator cannot."""
+        return {"_steps": None, "_result": [self.finish()], "_error": None}
 
     def _step(self) -> None:
         if self._error is not None:

@@ -3,14 +3,18 @@
 A bone has the name of Unity's HumanBodyBones, its position and rotation in its parent's frame, and no rotation in the
 T-pose. Unity's space is left-handed: +Y up, a character faces +Z and its left hand is toward -X. Ours is its mirror
 image through x = 0: a position (x, y, z) becomes (-x, y, z) and a rotation (x, y, z, w) becomes (x, -y, -z, w).
+
+Addresses under `/mapctl/`, which other programs pass over, have what the protocol lacks, in our own axes. One opens
+every packet of a frame, so that bones of two frames are never taken for one where packets were lost.
 """
 
 import multiprocessing
 import queue
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,16 +29,61 @@ from mapctl.features import PRIOR_FPS
 from mapctl.runtime.processes import send_queued, spawn
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.streaming.messages import Endpoint, Message
+from mapctl.streaming.orders import is_number
 from mapctl.streaming.post import StreamStatistics, run_post
 
 OK, TIME, ROOT, BONE = "/VMC/Ext/OK", "/VMC/Ext/T", "/VMC/Ext/Root/Pos", "/VMC/Ext/Bone/Pos"
 """Addresses: whether there is a character, the stream's time, the character's root, and one bone."""
 BONE_NAMES = tuple(name[0].upper() + name[1:] for name in CANONICAL.names)
 """Names of the canonical joints in Unity, in their order. There is no UpperChest: the neck hangs from the chest."""
+FRAME, CONTACTS, VELOCITY, FORECAST = (f"/mapctl/{name}" for name in ("frame", "contacts", "root_velocity", "forecast"))
+"""Addresses: the stream's time, which opens a packet; and `Guidance`."""
+_GUIDANCE = (CONTACTS, VELOCITY, FORECAST)
+_FORECAST_STEP = 5  # frames from one point of a streamed forecast to the next: a sixth of a second
 _AVAILABLE = (1, 3, 0)  # a model is loaded, calibrated, in the normal mode
 _ROOT_NAME = "root"
 _TRANSFORM_NUMBERS = 7  # three of a position, four of a rotation
 _MIRROR_POSITION, _MIRROR_QUAT = np.array([-1.0, 1.0, 1.0]), np.array([1.0, -1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Guidance:
+    """What the root and the feet do in a frame, and where the root will be, as numbers for a game's own logic."""
+
+    contacts: Float[ndarray, "2"]
+    """Left and right toe planted, 1 or 0."""
+    root_velocity: Float[ndarray, "2"]
+    """Velocity of the hips over the ground, x and z, m/s."""
+    forecast: Float[ndarray, "points 3"]
+    """Trajectory of the hips, a point each sixth of a second: x and z, metres, and heading, degrees."""
+
+    def encode(self) -> list[Message]:
+        """Return a message each."""
+        values = ((CONTACTS, self.contacts), (VELOCITY, self.root_velocity), (FORECAST, self.forecast.ravel()))
+        return [Message(address, tuple(map(float, numbers))) for address, numbers in values]
+
+    @staticmethod
+    def decode(numbers: Mapping[str, tuple[Any, ...]]) -> "Guidance | None":
+        """Return the guidance of messages by their addresses; None where it is not whole, or of other sizes."""
+        contacts, velocity, forecast = (np.array(numbers.get(one, (0.0,)), float) for one in _GUIDANCE)
+        if (len(contacts), len(velocity), len(forecast) % 3) != (2, 2, 0):
+            return None
+        return Guidance(contacts, velocity, forecast.reshape(-1, 3))
+
+
+def guide(
+    root: Float[ndarray, "frames 3"],
+    quats: Float[ndarray, "frames joints 4"],
+    contacts: Float[ndarray, "frames 2"],
+    root_velocity: Float[ndarray, "frames 2"],
+    trajectory: Float[ndarray, "ahead 3"],
+) -> list[Guidance]:
+    """Return the guidance of each frame of a step, whose forecast begins with the frames after it (`SteerFrames`)."""
+    heading = rotations.split_heading(torch.from_numpy(quats[:, 0]))[0].numpy()
+    ahead = np.concatenate([np.column_stack([root[:, ::2], heading]), trajectory])
+    ahead[:, 2] = np.degrees(np.angle(np.exp(1j * ahead[:, 2])))
+    points = [ahead[k + _FORECAST_STEP :: _FORECAST_STEP] for k in range(len(root))]
+    return [Guidance(*each) for each in zip(contacts, root_velocity, points, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +100,8 @@ class VmcFrame:
     """Each canonical joint in its parent's frame, metres; the hips in the root's."""
     bone_quats_xyzw: Float[ndarray, "joints 4"]
     """Rotation of each canonical joint in its parent's frame."""
+    guidance: Guidance | None = None
+    """Contacts, velocity and forecast, where the sender is mapctl and sends them."""
 
     def joint_positions(self) -> Float[ndarray, "joints 3"]:
         """Return the world positions of the canonical joints, metres, from the bones alone."""
@@ -70,8 +121,9 @@ def encode_frame(
     seconds: float,
     *,
     root_travels: bool = False,
+    guidance: Guidance | None = None,
 ) -> list[Message]:
-    """Return the messages of one frame.
+    """Return the messages of one frame, with its guidance where there is some.
 
     `skeleton` has the canonical joints with the character's bones, `position` is its hips in the world, metres, and
     `quats_xyzw` are the joints' rotations in their parents' frames. The root stays at the origin and the hips travel;
@@ -83,33 +135,49 @@ def encode_frame(
     values = np.concatenate([positions * _MIRROR_POSITION, quats_xyzw * _MIRROR_QUAT], axis=-1)
     root = (*(ground * _MIRROR_POSITION).tolist(), 0.0, 0.0, 0.0, 1.0)
     bones = [Message(BONE, (name, *row)) for name, row in zip(BONE_NAMES, values.tolist(), strict=True)]
-    return [Message(ROOT, (_ROOT_NAME, *root)), *bones, Message(OK, _AVAILABLE), Message(TIME, (float(seconds),))]
+    ends = [Message(OK, _AVAILABLE), Message(TIME, (float(seconds),))]
+    return [Message(ROOT, (_ROOT_NAME, *root)), *bones, *(guidance.encode() if guidance else ()), *ends]
+
+
+_PARTS = (ROOT, *BONE_NAMES)
 
 
 @dataclass
 class FrameAssembler:
-    """Receiver's side: collects messages to frames. A frame of which a bone was lost is left out."""
+    """Receiver's side: collects messages to frames. A frame of which a bone was lost is left out, and so is one that
+    arrives among the packets of another."""
 
-    _bones: dict[str, Float[ndarray, "7"]] = field(default_factory=dict)
-    _root: Float[ndarray, "7"] | None = None
+    _parts: dict[str, Float[ndarray, "7"]] = field(default_factory=dict)
+    _numbers: dict[str, tuple[object, ...]] = field(default_factory=dict)
+    _frame: tuple[object, ...] | None = None
 
     def take(self, message: Message) -> VmcFrame | None:
         """Take one message; return the frame that it completes. What is no pose, or no number, is passed over."""
-        if message.address == TIME:
-            return self._complete(message.arguments)
-        if message.address in (ROOT, BONE) and (found := _read_transform(message.arguments)) is not None:
-            if message.address == ROOT:
-                self._root = found[1]
-            elif found[0] in BONE_NAMES:
-                self._bones[found[0]] = found[1]
+        address, arguments = message.address, message.arguments
+        if address == TIME:
+            return self._complete(arguments)
+        if address == FRAME and arguments != self._frame:
+            self._forget()
+            self._frame = arguments
+        elif address in (ROOT, BONE) and (found := _read_transform(arguments)) is not None:
+            name = ROOT if address == ROOT else found[0]
+            if name in _PARTS:
+                self._parts[name] = found[1]
+        elif address in _GUIDANCE and all(map(is_number, arguments)):
+            self._numbers[address] = arguments
         return None
 
+    def _forget(self) -> None:
+        self._parts, self._numbers, self._frame = {}, {}, None
+
     def _complete(self, arguments: tuple[object, ...]) -> VmcFrame | None:
-        bones, self._bones, root = self._bones, {}, self._root
-        if len(bones) < len(BONE_NAMES) or root is None or not _are_numbers(arguments[:1]):
+        parts, numbers, frame = self._parts, self._numbers, self._frame
+        self._forget()
+        if len(parts) < len(_PARTS) or not _are_numbers(arguments[:1]) or frame not in (None, arguments):
             return None
-        rows = np.array([bones[name] for name in BONE_NAMES])
-        return VmcFrame(float(arguments[0]), root[:3], root[3:], rows[:, :3], rows[:, 3:])  # pyright: ignore[reportArgumentType]
+        root, rows = parts[ROOT], np.array([parts[name] for name in BONE_NAMES])
+        seconds: Any = arguments[0]
+        return VmcFrame(float(seconds), root[:3], root[3:], rows[:, :3], rows[:, 3:], Guidance.decode(numbers))
 
 
 def _read_transform(arguments: tuple[object, ...]) -> tuple[str, Float[ndarray, "7"]] | None:
@@ -122,7 +190,7 @@ def _read_transform(arguments: tuple[object, ...]) -> tuple[str, Float[ndarray, 
 
 
 def _are_numbers(values: tuple[object, ...]) -> bool:
-    return bool(values) and all(isinstance(value, int | float) and np.isfinite(value) for value in values)
+    return bool(values) and all(map(is_number, values))
 
 
 LATE_SECONDS = 0.5 / PRIOR_FPS
@@ -172,15 +240,20 @@ class PoseStream:
         seconds: float,
         root: Float[ndarray, "frames 3"],
         quats: Float[ndarray, "frames joints 4"],
+        guidance: Sequence[Guidance] = (),
     ) -> None:
         """Send frames of a character, at PRIOR_FPS, the first at `due` (a value of time.perf_counter); `seconds` is the
-        stream's time of the first, `root` the hips in the world, metres, and `quats` local rotations, xyzw."""
+        stream's time of the first, `root` the hips in the world, metres, `quats` local rotations, xyzw, and `guidance`
+        that of each frame, if there is any (`guide`)."""
         if self._queue.qsize() > _MAX_QUEUED:
             return
         skeleton = self._skeletons[character]
         for k in range(len(root)):
             at = k / PRIOR_FPS
-            messages = encode_frame(skeleton, root[k], quats[k], seconds + at, root_travels=self._root_travels)
+            guided = guidance[k] if guidance else None
+            messages = encode_frame(
+                skeleton, root[k], quats[k], seconds + at, root_travels=self._root_travels, guidance=guided
+            )
             self._queue.put(("put", character, due + at + self._delay, pack(messages)))
 
     def forget(self, character: int) -> None:
@@ -206,12 +279,15 @@ class PoseStream:
 
 
 def pack(messages: Sequence[Message]) -> list[bytes]:
-    """Pack messages into packets of at most 1200 bytes, OSC bundles, in order."""
-    bundles, size = [OscBundleBuilder(IMMEDIATELY)], _BUNDLE_HEAD
+    """Pack the messages of a frame, the time last, into packets of at most 1200 bytes, OSC bundles, in order. Each
+    begins with that time, by which a receiver finds the packets of a frame."""
+    opening = _build(Message(FRAME, messages[-1].arguments))
+    bundles, size = list[OscBundleBuilder](), _MAX_BUNDLE_BYTES
     for message in map(_build, messages):
         if size + _LENGTH_HEAD + message.size > _MAX_BUNDLE_BYTES:
             bundles.append(OscBundleBuilder(IMMEDIATELY))
-            size = _BUNDLE_HEAD
+            bundles[-1].add_content(opening)
+            size = _BUNDLE_HEAD + _LENGTH_HEAD + opening.size
         bundles[-1].add_content(message)
         size += _LENGTH_HEAD + message.size
     return [bundle.build().dgram for bundle in bundles]

@@ -1,12 +1,13 @@
 """Motion: slices, joins, other frame rates, mirror images."""
 
+import math
 from fractions import Fraction
 
 import pytest
 import torch
 from helpers import bandai_skeleton, generator, random_motion, turn_between
 
-from mapctl.errors import MapctlError
+from mapctl.errors import MapctlError, RequestError
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, Skeleton
 
@@ -53,6 +54,20 @@ def test_twice_the_rate_keeps_every_frame_and_puts_one_midway():
     right = turn_between(fine.local_quat_xyzw[1], fine.local_quat_xyzw[2])
     assert left == pytest.approx(right, abs=1e-6)
     same(fine.resample(30), motion)
+
+
+@pytest.mark.parametrize("fps", [0, -30, 1e-9, math.nan, math.inf, 1e12, "30"])
+def test_rates_that_cannot_be_are_refused(fps):
+    with pytest.raises(RequestError, match="frame rate"):
+        Motion.resample.__wrapped__(travelling(), fps)
+
+
+def test_poses_between_frames_and_beyond_the_ends():
+    motion = travelling()
+    found = motion.sample(torch.tensor([-3.0, 0.0, 1.5, 99.0], dtype=torch.float64))
+    same(found.slice(0, 2), motion.pick(torch.tensor([0, 0])))
+    same(found.slice(3, 4), motion.slice(motion.num_frames - 1, motion.num_frames))
+    torch.testing.assert_close(found.root_position[2], motion.root_position[1:3].mean(0))
 
 
 def test_a_mirror_image_has_every_joint_on_the_other_side():

@@ -1,14 +1,26 @@
 """Commands, tracks and the ramp between them; and the files that hold them."""
 
 import math
+from fractions import Fraction
 from itertools import pairwise
 
+import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import FileFormatError, RequestError
-from mapctl.intent.steering import STEP_LENGTHS, Command, CommandTrack, SteeringLimits, SteeringTarget, read_commands
+from mapctl.intent.steering import (
+    STEP_LENGTHS,
+    Arrival,
+    Command,
+    CommandTrack,
+    SteeringLimits,
+    SteeringTarget,
+    read_commands,
+)
 
 ANGLES = st.floats(-20, 20)
 SPEEDS = st.floats(0, 5)
@@ -68,6 +80,57 @@ def test_impossible_steps_are_brought_near_and_reported():
 def test_what_cannot_be_is_refused(wrong, message):
     with pytest.raises(RequestError, match=message):
         wrong()
+
+
+def plain(kind, *values, **named):
+    """Build without the tests' own check of types, which users do not have."""
+    found = object.__new__(kind)
+    kind.__init__.__wrapped__(found, *values, **named)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda: plain(Command, "1.2", 0), "speed must be a finite number, got '1.2'"),
+        (lambda: plain(Command, np.array([1.0, 2.0]), 0), "speed must be a finite number"),
+        (lambda: plain(Command, torch.ones(2), 0), "speed must be a finite number"),
+        (lambda: plain(Command, 1, None), "heading must be a finite number"),
+        (lambda: plain(Command, 1, 10**400), "heading must be a finite number"),
+        (lambda: plain(Command, 1, 0, step_length=0), "step length must be positive"),
+        (lambda: plain(Command, 1, 0, reach=[3]), "reaches with leftHand or rightHand"),
+        (lambda: plain(Command, 1, 0, reach={"leftHand": "abc"}), "leftHand must be three finite numbers"),
+        (lambda: plain(Command, 1, 0, look_at=3.0), "look_at must be three finite numbers"),
+        (lambda: plain(Command, 1, 0, labels="run"), "labels must be a sequence of names, got 'run'"),
+        (lambda: plain(Command, 1, 0, labels=(3,)), "labels must be a sequence of names"),
+        (lambda: plain(Command, 1, 0, obstacles=[(0, 1, 2)]), "must be a sequence of Obstacle"),
+        (lambda: plain(Command, 1, 0, obstacles=Obstacle((0, 1), 0.3)), "must be a sequence of Obstacle"),
+        (lambda: plain(Command, 1, 0, arrival=(1, 2)), "must be an Arrival"),
+        (lambda: plain(Arrival, (1, 2, 3), 1), "position of an arrival must be two finite numbers"),
+        (lambda: plain(Arrival, (1, 2), "soon"), "by must be a finite number"),
+        (lambda: plain(Arrival, (1, 2), 1, facing=math.nan), "facing must be a finite number"),
+        (lambda: plain(Arrival, (1, 2), 1, pose=3), "pose of an arrival must be a Motion"),
+        (lambda: plain(Obstacle, (math.nan, 0), 0.3), "position of an obstacle must be two finite numbers"),
+        (lambda: plain(Obstacle, (0, 0), "wide"), "radius of an obstacle must be a finite number"),
+        (lambda: plain(Obstacle, (0, 0), size=(1, 2, 3)), "size of an obstacle must be two finite numbers"),
+        (lambda: plain(Obstacle, (0, 0), size=(1, 0)), "must be positive"),
+        (lambda: plain(SteeringLimits, braking="hard"), "braking must be a finite number"),
+    ],
+)
+def test_what_is_of_another_type_is_refused_in_a_line(wrong, message):
+    with pytest.raises(RequestError, match=message):
+        wrong()
+
+
+@pytest.mark.parametrize("number", [np.float32, np.array, torch.tensor, Fraction])
+def test_numbers_of_any_library_become_pythons(number):
+    point = np.array([0.5, 1.0, 2.0], dtype=np.float32)
+    reach, look_at = {"leftHand": point}, torch.tensor(point)
+    command = plain(Command, number(1.5), number(0.25), step_length=number(0.5), reach=reach, look_at=look_at)
+    assert command == Command(1.5, 0.25, step_length=0.5, reach={"leftHand": (0.5, 1, 2)}, look_at=(0.5, 1, 2))
+    assert {type(value) for value in (command.speed, command.heading, command.step_length, *command.look_at)} == {float}
+    assert plain(Arrival, point[:2], number(1.5)) == Arrival((0.5, 1.0), 1.5)
+    assert plain(Obstacle, point[:2], number(0.5)) == Obstacle((0.5, 1.0), 0.5)
 
 
 @pytest.fixture

@@ -1,6 +1,8 @@
 """Contract of every density (see mapctl.protocols.Density)."""
 
+import copy
 import math
+import pickle
 
 import pytest
 import torch
@@ -52,6 +54,16 @@ def test_it_has_what_it_must(density):
     assert starts.state.batch == len(starts.names) == len(starts.speed) == len(starts.weight)
     assert float(starts.weight.sum()) == pytest.approx(1)
     density.warm_up()
+
+
+@each_density
+def test_it_is_pickled_and_copied_after_use_as_before(density):
+    size = len(pickle.dumps(density))
+    draws, plan, *expected = roll(density, warm(density))
+    assert len(pickle.dumps(density)) == size, "without what is cached"
+    for copied in (pickle.loads(pickle.dumps(density)), copy.deepcopy(density)):  # noqa: S301
+        for ours, theirs in zip(copied.rollout(warm(copied), draws, plan), expected, strict=True):
+            assert torch.equal(ours, theirs)
 
 
 @each_density

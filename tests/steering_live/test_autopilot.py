@@ -26,6 +26,7 @@ def at_place(pilot: Autopilot, x: float, z: float) -> None:
             Status(Outcome.DONE),
             Ledger(),
             contacts=torch.zeros(1, 2),
+            root_velocity=torch.zeros(1, 2),
             steering_targets=(),
             forecast=torch.zeros(0, 21, 3),
         ),

@@ -50,7 +50,7 @@ def frame(seed: int):
 
 def sent_over(messages):
     """Messages after packing, as 32-bit numbers."""
-    return [message for packet in pack(messages) for message in read_messages(packet)]
+    return unpacked(pack(messages))
 
 
 def assembled(messages):
@@ -115,6 +115,57 @@ def test_a_frame_with_a_lost_packet_is_left_out():
     first, second = ([*read_messages(packet)] for packet in pack(messages))
     assert len(assembled([*first, *second, *second, *first, *second])) == 2
     assert assembled(second) == []
+
+
+def guided(seconds: float) -> list[bytes]:
+    """Packets of a random pose, with guidance."""
+    motion = random_motion(body(0), 1, seed=int(10 * seconds))
+    guidance = sender.Guidance(np.array([1.0, 0.0]), np.array([0.0, seconds]), np.full((6, 3), seconds))
+    root, quats = motion.root_position[0].numpy(), motion.local_quat_xyzw[0].numpy()
+    return pack(sender.encode_frame(motion.skeleton, root, quats, seconds, guidance=guidance))
+
+
+def unpacked(packets):
+    return [message for packet in packets for message in read_messages(packet)]
+
+
+SENT = {seconds: guided(seconds) for seconds in (0.1, 0.2, 0.3)}
+PACKETS = [packet for packets in SENT.values() for packet in packets]
+
+
+@settings(max_examples=50)
+@given(st.lists(st.sampled_from(PACKETS), max_size=12))
+def test_whatever_packets_are_lost_doubled_or_late_no_frame_is_of_two(packets):
+    for found in assembled(unpacked(packets)):
+        (sent,) = assembled(unpacked(SENT[round(found.seconds, 1)]))
+        np.testing.assert_array_equal(found.bone_quats_xyzw, sent.bone_quats_xyzw)
+        np.testing.assert_array_equal(found.root_position, sent.root_position)
+        np.testing.assert_array_equal(found.guidance.forecast, sent.guidance.forecast)
+
+
+def test_a_frame_with_guidance_is_two_packets_of_1200_bytes():
+    assert len(PACKETS) == 6
+    assert max(map(len, PACKETS)) <= 1200
+
+
+@pytest.mark.parametrize("address", [sender.CONTACTS, sender.VELOCITY, sender.FORECAST])
+@pytest.mark.parametrize("numbers", [(1.0,), (1.0, math.nan), ("left", "right")])
+def test_guidance_that_is_not_whole_is_left_out(address, numbers):
+    messages = unpacked(SENT[0.1])
+    wrong = [Message(address, numbers) if message.address == address else message for message in messages]
+    (found,) = assembled(wrong)
+    assert found.guidance is None
+
+
+def test_the_forecast_of_each_frame_begins_a_sixth_of_a_second_after_it():
+    motion = walk(40, turn_rate=0.5)
+    root, quats = motion.root_position.numpy(), motion.local_quat_xyzw.numpy()
+    heading = np.unwrap(2 * np.arctan2(quats[:, 0, 1], quats[:, 0, 3]))
+    path = np.column_stack([root[:, ::2], heading])
+    found = sender.guide(root[:3], quats[:3], np.zeros((3, 2)), np.zeros((3, 2)), path[3:34])
+    for k, each in enumerate(found):
+        np.testing.assert_allclose(each.forecast[:, :2], path[k + 5 : 34 : 5, :2])
+        np.testing.assert_allclose(each.forecast[:, 2], np.degrees(path[k + 5 : 34 : 5, 2]), atol=1e-6)
 
 
 @pytest.mark.parametrize(
