@@ -23,7 +23,7 @@ from mapctl.motion import Motion
 from mapctl.numerics import gaussian
 from mapctl.numerics.easing import smootherstep
 from mapctl.numerics.intervals import true_intervals
-from mapctl.skeleton import CANONICAL, FEET, LIMBS, TOES, leg_length
+from mapctl.skeleton import CANONICAL, FEET, LIMBS, TOES, Skeleton, leg_length
 from mapctl.terms import Keyframe
 
 SIDES = ("left", "right")
@@ -175,16 +175,18 @@ class Displacement:
         )
 
 
-def plan_footsteps(displacement: Displacement, frames: int) -> list[Footstep]:
-    """Plan the steps of a displacement within so many frames at PRIOR_FPS; none where no foot has to move.
+def plan_footsteps(displacement: Displacement, frames: int, *, least: int = 0) -> list[Footstep]:
+    """Plan the steps of a displacement within so many frames at PRIOR_FPS, `least` of them at least; none where no foot
+    has to move.
 
-    Feet alternate. Of the plans that begin with either foot the one counts whose feet are least apart at most, and do
-    not cross: the first is on the side to which the body turns or steps.
+    Feet alternate, or one follows to the side of the other. Of the plans that begin with either foot the one counts
+    whose feet are least apart at most, and do not cross: the first is on the side to which the body turns or steps.
     """
-    if displacement.distance < _MOVED and displacement.turn < _TURNED:
+    if not least and displacement.distance < _MOVED and displacement.turn < _TURNED:
         return []
-    count = max(displacement.count_steps(), frames // _SLOWEST)
+    count = max(displacement.count_steps(), frames // _SLOWEST, least)
     plans = [_lay_steps([(first + number) % 2 for number in range(count)], frames) for first in range(2)]
+    plans += [_lay_side_steps(displacement, first, frames) for first in range(2)]
     plan = min(plans, key=lambda plan: _measure_strain(displacement, plan))
     shares = torch.tensor([step.share for step in plan], dtype=torch.float64)
     toes = [displacement.toes_at(foot, shares)[0][:, ::2].tolist() for foot in range(2)]
@@ -213,6 +215,21 @@ def _lay_steps(feet: Sequence[int], frames: int) -> list[Footstep]:
     for number, foot in enumerate(feet):
         lift = both + number * (swing + both)
         plan.append(Footstep(foot, round(lift), round(lift + swing), _share_of(number, count)))
+    return plan
+
+
+_ASIDE, _PAIR = 0.5, 30  # of legs' length that a foot steps aside at most, and frames of the steps of both feet
+
+
+def _lay_side_steps(displacement: Displacement, first: int, frames: int) -> list[Footstep]:
+    """Lay steps by which a foot goes ahead, and the other one comes beside it."""
+    length = _ASIDE * leg_length(displacement.start.skeleton)
+    pairs = max(1, math.ceil(displacement.distance / length - 1e-6), round(frames / _PAIR))
+    each, plan = (frames - 1) / pairs, list[Footstep]()
+    for pair in range(pairs):
+        for half, foot in enumerate((first, 1 - first)):
+            lift, land = (round((pair + part + 0.49 * half) * each) for part in (0.04, 0.47))
+            plan.append(Footstep(foot, lift, land, (pair + 1) / pairs))
     return plan
 
 
@@ -345,23 +362,42 @@ def _smooth_between(values: Float[Tensor, " frames"]) -> Float[Tensor, " frames"
 
 def _stand_on(motion: Motion, toes: Float[Tensor, "frames 2 3"], turns: Float[Tensor, "frames 2 4"]) -> Motion:
     """Bring the feet of a motion to positions of the toe joints and rotations in the world; hips go lower where a leg
-    does not reach."""
-    skeleton, positions = motion.skeleton, motion.joint_positions()
-    lower, ankles = torch.zeros(motion.num_frames, dtype=torch.float64), []
-    for foot, limb in enumerate(_LEGS):
-        offset = skeleton.offsets[CANONICAL.index(TOES[foot])].to(toes)
-        ankles.append(toes[:, foot] - rotations.rotate(turns[:, foot], offset.expand(len(toes), 3)))
-        away = positions[:, limb.upper] - ankles[foot]
-        reached = max(_STRETCHED * limb.length(skeleton), *away[[0, -1]].norm(dim=-1).tolist())
-        highest = (reached**2 - away[:, ::2].square().sum(dim=-1)).clamp_min(0).sqrt()
-        lower = torch.maximum(lower, away[:, 1] - highest)
+    does not reach, but for the first and the last frame."""
+    ankles = find_ankles(motion.skeleton, toes, turns)
+    lower = find_lowering(motion, ankles, keeps_ends=True)
     lower = torch.nn.functional.max_pool1d(lower[None], 9, 1, 4)[0]
     lower[[0, -1]] = 0.0
-    lower = _smooth_between(lower)
-    root = motion.root_position - torch.stack([0 * lower, lower, 0 * lower], dim=-1)
-    motion = replace(motion, root_position=root)
-    quats = bend_legs(motion, torch.stack(ankles, dim=1), turns).local_quat_xyzw
-    return replace(motion, local_quat_xyzw=rotations.make_sign_continuous(quats))
+    motion = bend_legs(lower_hips(motion, _smooth_between(lower)), ankles, turns)
+    return replace(motion, local_quat_xyzw=rotations.make_sign_continuous(motion.local_quat_xyzw))
+
+
+def find_ankles(
+    skeleton: Skeleton, toes: Float[Tensor, "frames 2 3"], turns: Float[Tensor, "frames 2 4"]
+) -> Float[Tensor, "frames 2 3"]:
+    """Find the ankles of feet with toe joints at positions, metres, and rotations in the world."""
+    offsets = skeleton.offsets[list(CANONICAL.indices(TOES))].to(toes)
+    return toes - rotations.rotate(turns, offsets.expand_as(toes))
+
+
+def find_lowering(
+    motion: Motion, ankles: Float[Tensor, "frames 2 3"], *, keeps_ends: bool = False
+) -> Float[Tensor, " frames"]:
+    """Find by how much hips are too high for legs, hardly bent, to reach ankles, metres; legs that are straighter in
+    the first or the last frame may be so throughout where `keeps_ends`."""
+    positions, lower = motion.joint_positions(), torch.zeros(motion.num_frames, dtype=torch.float64)
+    for foot, limb in enumerate(_LEGS):
+        away = positions[:, limb.upper] - ankles[:, foot]
+        reached = _STRETCHED * limb.length(motion.skeleton)
+        if keeps_ends:
+            reached = max(reached, *away[[0, -1]].norm(dim=-1).tolist())
+        highest = (reached**2 - away[:, ::2].square().sum(dim=-1)).clamp_min(0).sqrt()
+        lower = torch.maximum(lower, away[:, 1] - highest)
+    return lower
+
+
+def lower_hips(motion: Motion, lower: Float[Tensor, " frames"]) -> Motion:
+    """Lower the hips by so many metres."""
+    return replace(motion, root_position=motion.root_position - torch.stack([0 * lower, lower, 0 * lower], dim=-1))
 
 
 def bend_legs(motion: Motion, ankles: Float[Tensor, "frames 2 3"], turns: Float[Tensor, "frames 2 4"]) -> Motion:

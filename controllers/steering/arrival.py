@@ -17,20 +17,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from controllers.steering.steer import (
-    KEPT_FRAMES,
     Approach,
     Refusal,
     SteerFrames,
     SteerState,
+    commit_frames,
     condition_prior,
     deliver,
     step,
 )
 from mapctl import rotations
-from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root, reversed_features
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, reversed_features
 from mapctl.intent.steering import Arrival, Command, SteeringTarget
 from mapctl.pose import decode
-from mapctl.problem.receding_horizon import CommittedFrames, replay
 from mapctl.runtime.stepwise import StepwiseWork
 
 LEAST_FRAMES = 4
@@ -38,7 +37,6 @@ LEAST_FRAMES = 4
 _FAR = 0.3  # metres beyond which the direction to a target is the facing there
 _CANDIDATES = 4  # moments of the prior that are tried at the position
 _AFTER = 10  # frames of the prior's own continuation, as context of how motion continues from there
-_JUDGED_FRAMES = 60  # that are kept for terms that look back
 
 
 @runtime_checkable
@@ -62,23 +60,6 @@ class TransitionMaker(Protocol):
         runs backwards, `frames` later, at `position`, metres, and turned by `turn`, relative to the last of `before`.
         """
         ...
-
-
-def commit_frames(state: SteerState, new: Float[Tensor, "frames size"]) -> CommittedFrames:
-    """Return what is committed after frames that were not solved: the density's state is advanced over them."""
-    committed = state.committed
-    start = GroundPose(committed.ground_pose.position_xz.double(), committed.ground_pose.heading.double())
-    ground, facing = integrate_root(new.double(), start)  # in single precision a long one would miss the target
-    unit = decode(new, committed.ground_pose, skeleton=state.character.unit_skeleton)
-    joints = torch.cat([committed.joints_world, unit.joint_positions().to(committed.joints_world)])
-    return replace(
-        committed,
-        state=replay(state.prior, new, committed.state),  # pyright: ignore[reportArgumentType]
-        ground_pose=GroundPose(ground[-1].float(), facing[-1].float()),
-        features=torch.cat([committed.features, new]),
-        joints_world=joints[-_JUDGED_FRAMES:],
-        warm_start=committed.warm_start[:0],
-    ).discard_history(KEPT_FRAMES)
 
 
 def needed_speed(state: SteerState, order: Arrival, frames: int) -> float:

@@ -21,6 +21,15 @@ from torch import Tensor
 from controllers.common.character import Character
 from controllers.common.initial_state import start_from_state
 from controllers.steering.overlay import Overlay
+from controllers.steering.steps import (
+    PLANNED_FRAMES,
+    PlannedSteps,
+    Stand,
+    find_pose,
+    find_stand,
+    needs_steps,
+    plan_steps,
+)
 from mapctl import rotations
 from mapctl.arguments import read_number, read_point
 from mapctl.curves.obstacles import Obstacle, measure_clearance
@@ -28,11 +37,12 @@ from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed, integra
 from mapctl.intent.steering import STEP_LENGTHS, Arrival, Command, SteeringLimits, SteeringTarget
 from mapctl.motion import Motion
 from mapctl.pose import BodyPose, decode
-from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver
+from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver, replay
 from mapctl.problem.solution import Ledger, Outcome, Solution, Status
 from mapctl.problem.unknowns import WindowRequest
 from mapctl.problem.window_solvers import (
     BestOfSamples,
+    GuidedNoiseSolver,
     LatentNoiseSolver,
     SingleWindowSolver,
     SolvedWindow,
@@ -78,6 +88,7 @@ def lead_around(
 
 KEPT_FRAMES = 11
 """Last frames whose features are kept: an arrival continues from them."""
+_JUDGED_FRAMES = 60  # that are kept for terms that look back
 _PAST_TARGET_FRAMES = 60  # past targets that are kept: more than the root velocity term looks back on
 _RECENT_FRAMES = 15  # frames, half a second, over which the velocity error is measured
 _MIN_TRAVEL_SPEED = 0.3  # m/s below which the velocity has no direction
@@ -214,6 +225,10 @@ class SteerState:
     """Motion of hands and head on top of the walk."""
     cost: StepCost = field(default_factory=StepCost)
     """Cost of recent steps."""
+    steps: PlannedSteps | None = None
+    """Planned steps from which the search of a step starts; what is left of the last ones."""
+    stand: Stand | None = None
+    """Where the body stands; None where it does not."""
     approach: Approach | None = None
     """Last order to be somewhere, and how far it is carried out (`controllers.steering.arrival`)."""
 
@@ -317,12 +332,18 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
     began, settings, character = time.perf_counter(), state.settings, state.character
     seconds = None if seconds is None else read_number(seconds, "the seconds of a step")
     asked, command = command, character.command(_lead_around(state, command))
-    stuck = _velocity_error(state) > settings.stuck
+    steps, stand = _find_steps(state, command), None
+    if steps is None and (stand := _find_stand(state, command)) is not None:
+        return _stand_still(replace(state, stand=stand), asked, began)
+    if steps is not None and steps is not state.steps:
+        state = replace(state, target=_start_target(state, command))
+    state = replace(state, steps=steps, stand=None)
+    stuck = steps is None and _velocity_error(state) > settings.stuck
     if stuck:
         state = _restart_target(state)
     targets, leaving = _plan_targets(state, command)
     conditioned = replace(state, prior=condition_prior(state.prior, command.labels))
-    free = stuck or leaving
+    free = steps is None and (stuck or leaving)
     sigma_facing = min(settings.sigma_facing, _SIGMA_LEAVING) if free else settings.sigma_facing
     terms = (*_build_steering_terms(state, targets, command.step_length, sigma_facing), *state.terms)
     if asked.obstacles:
@@ -339,6 +360,7 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
     status = Status(Outcome.BUDGET, (note,)) if cut_short else Status(Outcome.DONE)
     committed = done.discard_history(max(len(new), KEPT_FRAMES))
     after, frames = deliver(state, committed, new, targets[: settings.commit], asked, done.ahead, done.forecast)
+    after = replace(after, steps=steps and steps.after(len(new)))
     ledger, spent = character.ledger(done.ledger), time.perf_counter() - began
     cost = state.cost.learn(spent, record.evaluations, search=search, cut_short=cut_short)
     return replace(after, cost=cost), replace(
@@ -437,7 +459,10 @@ def _solve_step(
 ) -> tuple[CommittedFrames, Outcome]:
     settings = state.settings
     method: SingleWindowSolver = _limit_evaluations(state, settings.evaluations, seconds)
-    if free:
+    if state.steps is not None:
+        method = GuidedNoiseSolver(state.steps.window(settings.horizon), 1.0, method.lbfgs, method.budget)
+        state = replace(state, committed=replace(state.committed, warm_start=state.committed.warm_start[:0]))
+    elif free:
         half = _limit_evaluations(state, settings.evaluations // 2, seconds and seconds / 2)
         method = _relax_footing_first(half, settings.random_starts, terms, settings.footing)
     window = HorizonSettings(frames=settings.horizon, overlap=settings.horizon - settings.commit)
@@ -453,6 +478,82 @@ def _limit_evaluations(state: SteerState, evaluations: int, seconds: float | Non
     most = max(1, evaluations)
     budget = Budget(most, seconds, evaluation_seconds=state.cost.evaluation)
     return LatentNoiseSolver(rounds=1, lbfgs=LbfgsSettings(max_iterations=most), budget=budget)
+
+
+def _find_steps(state: SteerState, command: Command) -> PlannedSteps | None:
+    """Find the planned steps from which the search starts: those under way, or new ones of a body that is at rest and
+    whose command leads to no walk, or to a stand."""
+    if state.steps is not None and state.steps.obey(command):
+        return state.steps
+    heading = float(state.committed.ground_pose.heading)
+    if not _is_at_rest(state) or not (command.speed == 0 or needs_steps(command, heading)):
+        return None
+    came_to_stand = state.stand is not None or (state.steps is not None and state.steps.command.speed == 0)
+    if came_to_stand and not needs_steps(command, heading):
+        return None
+    targets = [SteeringTarget(0.0, command.hips_heading, command.hips_heading)]
+    if command.speed > 0:
+        start = _start_target(state, command)
+        targets = start.ahead(command, state.settings.limits, frames=PLANNED_FRAMES, fps=PRIOR_FPS)
+    return plan_steps(_find_pose(state), _find_mean_stand(state), command, targets)
+
+
+def _start_target(state: SteerState, command: Command) -> SteeringTarget:
+    """Return the steering target from which a body at rest sets out: it can go any direction at once."""
+    return SteeringTarget(0.0, command.heading, float(state.committed.ground_pose.heading))
+
+
+def _find_stand(state: SteerState, command: Command) -> Stand | None:
+    """Find the stand of a body at rest that is to stand as it does."""
+    if command.speed > 0 or command.turning is not None or not _is_at_rest(state):
+        return None
+    return state.stand or Stand(_find_pose(state), _find_mean_stand(state))
+
+
+def _is_at_rest(state: SteerState) -> bool:
+    """Return whether the body hardly went in the last half second."""
+    went = len(state.committed.joints_world) > _RECENT_FRAMES and float(_recent_velocity(state).norm())
+    return went is not False and went < state.settings.standing
+
+
+def _find_pose(state: SteerState) -> Motion:
+    committed, skeleton = state.committed, state.character.unit_skeleton
+    return find_pose(committed.features[-1], committed.ground_pose, skeleton)
+
+
+def _find_mean_stand(state: SteerState) -> Motion:
+    """Return the stand where the body is."""
+    skeleton, toe_height = state.character.unit_skeleton, state.settings.footing.rest_height
+    return find_stand(state.prior.feature_mean, state.committed.ground_pose, skeleton, toe_height)
+
+
+def _stand_still(state: SteerState, command: Command, began: float) -> tuple[SteerState, SteerFrames]:
+    """Deliver the next frames of a stand, without a search."""
+    assert state.stand is not None
+    stand, features = state.stand.advance(state.settings.horizon)
+    new, ahead = features[: state.settings.commit], features[state.settings.commit :]
+    stand = replace(stand, frames=state.stand.frames + len(new))
+    facing = float(state.committed.ground_pose.heading)
+    target = SteeringTarget(0.0, facing, facing)
+    after, frames = deliver(state, commit_frames(state, new), new, [target] * len(new), command, ahead)
+    return replace(after, stand=stand, steps=None), replace(frames, seconds=time.perf_counter() - began)
+
+
+def commit_frames(state: SteerState, new: Float[Tensor, "frames size"]) -> CommittedFrames:
+    """Return what is committed after frames that were not solved: the density's state is advanced over them."""
+    committed = state.committed
+    start = GroundPose(committed.ground_pose.position_xz.double(), committed.ground_pose.heading.double())
+    ground, facing = integrate_root(new.double(), start)  # in single precision a long one would miss the target
+    unit = decode(new, committed.ground_pose, skeleton=state.character.unit_skeleton)
+    joints = torch.cat([committed.joints_world, unit.joint_positions().to(committed.joints_world)])
+    return replace(
+        committed,
+        state=replay(state.prior, new, committed.state),  # pyright: ignore[reportArgumentType]
+        ground_pose=GroundPose(ground[-1].float(), facing[-1].float()),
+        features=torch.cat([committed.features, new]),
+        joints_world=joints[-_JUDGED_FRAMES:],
+        warm_start=committed.warm_start[:0],
+    ).discard_history(KEPT_FRAMES)
 
 
 def _velocity_error(state: SteerState) -> float:
