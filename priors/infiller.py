@@ -10,10 +10,10 @@ from torch.nn.functional import leaky_relu, max_pool1d, max_pool2d
 
 from mapctl import rotations
 from mapctl.errors import RequestError
-from mapctl.inbetweening import PositionImage, ProposedPositions
-from mapctl.inbetweening.position_image import mirror_positions
+from mapctl.inbetweening import GapQuery, PositionImage, Proposal, ProposedPositions
+from mapctl.inbetweening.position_image import mirror_positions, propose_from_positions
 from mapctl.numerics.intervals import count_frames_to_observed
-from mapctl.protocols import PositionInfiller
+from mapctl.protocols import Inbetweener
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
 from priors.checkpoints import NetworkConfig
@@ -186,10 +186,14 @@ class InfillerNetwork(nn.Module):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ConvInfiller(checkpoints.NetworkModel[InfillerNetwork], PositionInfiller):
+class ConvInfiller(checkpoints.NetworkModel[InfillerNetwork], Inbetweener):
     """A trained infiller."""
 
     kind, parts = "infiller", (InfillerNetwork, InfillerConfig)
+
+    def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
+        """Propose a motion of rigid bones near the positions of `complete`."""
+        return propose_from_positions(query, self.complete, self.kind)
 
     @torch.no_grad()
     def complete(self, image: PositionImage) -> ProposedPositions:

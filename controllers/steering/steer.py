@@ -28,17 +28,18 @@ from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, Re
 from mapctl.problem.solution import Ledger, Outcome, Solution, Status
 from mapctl.problem.unknowns import WindowRequest
 from mapctl.problem.window_solvers import (
-    BestOfSamples,
     LatentNoiseSolver,
     SingleWindowSolver,
     SolvedWindow,
     SteeringKnots,
+    SwarmProposal,
 )
 from mapctl.protocols import Density
 from mapctl.runtime.stepwise import StepwiseWork
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings, LbfgsStatus
+from mapctl.solver.swarm import SwarmSettings
 from mapctl.terms import FootContact, KeepClear, LatentPrior, RootVelocity, StepLength, Term
 
 _BODY = 0.4  # metres from an obstacle's edge to the hips that pass it
@@ -457,7 +458,7 @@ def _relax_footing_first(
     predicts new contacts."""
     space = SteeringKnots(_KNOTS, tuple(LAYOUT.slices)[:-1], _KNOT_SIGMA)
     budget = replace(half.budget, evaluations=samples + (half.budget.evaluations or 1))
-    relaxed = replace(half, proposal=BestOfSamples(samples, space), budget=budget)
+    relaxed = replace(half, proposal=SwarmProposal(SwarmSettings(samples, iterations=1), space), budget=budget)
     others = [term for term in terms if term.name != footing.name]
 
     def solve(request: WindowRequest) -> SolvedWindow:

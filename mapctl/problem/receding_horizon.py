@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, integrate_root
+from mapctl.features import LAYOUT, GroundPose, integrate_root
 from mapctl.problem.density_selection import DensityEnsemble
 from mapctl.problem.solution import Ledger, Outcome, WindowRecord
 from mapctl.problem.unknowns import WindowContext, WindowRequest
@@ -115,8 +115,6 @@ class RecedingHorizonSolver:
     """Lengths of windows."""
     skeleton: Skeleton = CANONICAL
     """Bones of the character."""
-    fps: float = PRIOR_FPS
-    """Frames per second."""
     method: SingleWindowSolver = field(default_factory=LatentNoiseSolver)
     """Solver of one window."""
 
@@ -174,7 +172,6 @@ class RecedingHorizonSolver:
             committed.joints_world,
             frames,
             self.skeleton,
-            self.fps,
             contacts_before=committed.contacts,
             heels_before=committed.locate_heels(self.skeleton),
             first_frame=committed.discarded + len(committed.features),

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl.errors import MapctlError
-from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose
+from mapctl.features import LAYOUT, GroundPose
 from mapctl.kinematics import fast
 from mapctl.numerics import gaussian
 from mapctl.pose import BodyPose
@@ -45,8 +45,6 @@ class WindowContext:
     """Number of frames in the window."""
     skeleton: Skeleton = CANONICAL
     """Bones of the character."""
-    fps: float = PRIOR_FPS
-    """Frames per second."""
     contacts_before: Bool[Tensor, "*batch 2"] = field(default_factory=lambda: torch.zeros(2, dtype=torch.bool))
     """Left and right toe planted in the last committed frame; unbatched or one row a candidate."""
     heels_before: Float[Tensor, "known 2 3"] = field(default_factory=lambda: torch.zeros(0, 2, 3))
@@ -89,7 +87,6 @@ class WindowContext:
             contacts_before=self.contacts_before,
             heels_before=self.heels_before,
             skeleton=self.skeleton,
-            fps=self.fps,
             first_frame=self.first_frame,
         )
 

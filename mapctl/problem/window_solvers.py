@@ -1,13 +1,12 @@
 """Solvers of one window: a start, a parametrisation of its frames, and L-BFGS over the unknowns.
 
-The search over a rollout's noise starts at the last window's noise, the best of random draws, or a particle swarm over
-a few numbers that steer: noise at a few knots in time, linear in between. All the noise of a window (34 x 66 numbers)
-is too many dimensions for a swarm.
+The search over a rollout's noise starts at the last window's noise, or at the best of a particle swarm over a few
+numbers that steer: noise at a few knots in time, linear in between. All the noise of a window (34 x 66 numbers) is too
+many dimensions for a swarm.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import TypeAlias
 
 import torch
@@ -22,7 +21,7 @@ from mapctl.problem.solution import Ledger
 from mapctl.problem.unknowns import LatentNoise, PoseOffsets, WindowRequest
 from mapctl.solver.budget import Budget, Meter
 from mapctl.solver.lbfgs import LbfgsResult, LbfgsSettings, minimise
-from mapctl.solver.swarm import SwarmResult, SwarmSettings, run_best_of_samples, run_swarm
+from mapctl.solver.swarm import SwarmSettings, run_swarm
 from mapctl.terms.base import Term
 from mapctl.terms.likelihood import LatentPrior, Likelihood
 from mapctl.terms.trial import Trial
@@ -61,40 +60,8 @@ class SteeringKnots:
         noise[..., self._columns()] = dense.transpose(1, 2)
         return noise
 
-    def search(
-        self, method: Callable[..., SwarmResult], request: WindowRequest, warm: Float[Tensor, "1 unknowns"]
-    ) -> Float[Tensor, "1 unknowns"]:
-        """Return the unknowns of the best point about the warm start that a method finds, each under its own plan."""
-
-        def unknowns(points: Float[Tensor, "batch size"]) -> Float[Tensor, "batch unknowns"]:
-            return warm + self.expand(points.to(warm.dtype), request.context.frames).flatten(1)
-
-        def energy(points: Float[Tensor, "batch size"]) -> Float[Tensor, " batch"]:
-            noise = unknowns(points)
-            with torch.no_grad():
-                return Objective(LatentNoise.from_unknowns(request.context, noise).build, request.terms).energy(noise)
-
-        found = method(energy, start=torch.zeros(self.size()), spread=self.spread, generator=request.generator)
-        return unknowns(found.x[None])
-
     def _columns(self) -> list[int]:
         return [i for block in self.blocks for i in range(LAYOUT.slices[block].start, LAYOUT.slices[block].stop)]
-
-
-@dataclass(frozen=True)
-class BestOfSamples:
-    """The best of random draws in the steering space, the warm start among them."""
-
-    count: int = 32
-    """Number of draws."""
-    space: SteeringKnots = SteeringKnots()
-    """Space in which they are drawn."""
-
-    def __call__(
-        self, request: WindowRequest, warm: Float[Tensor, "1 unknowns"], meter: Meter
-    ) -> Float[Tensor, "1 unknowns"]:
-        """Return the best draw; the meter counts what was evaluated."""
-        return self.space.search(partial(run_best_of_samples, count=self.count, meter=meter), request, warm)
 
 
 @dataclass(frozen=True)
@@ -102,15 +69,28 @@ class SwarmProposal:
     """A particle swarm (Wang et al. 2019, section 5.2) in the steering space, started at the warm start."""
 
     settings: SwarmSettings = field(default_factory=SwarmSettings)
-    """Number of particles and iterations."""
+    """Number of particles and iterations; with one iteration the best of random draws."""
     space: SteeringKnots = SteeringKnots()
     """Space in which they move."""
 
     def __call__(
         self, request: WindowRequest, warm: Float[Tensor, "1 unknowns"], meter: Meter
     ) -> Float[Tensor, "1 unknowns"]:
-        """Return the best point of the swarm; the meter counts what was evaluated."""
-        return self.space.search(partial(run_swarm, settings=self.settings, meter=meter), request, warm)
+        """Return the best point of the swarm, each under its own plan; the meter counts what was evaluated."""
+
+        def unknowns(points: Float[Tensor, "batch size"]) -> Float[Tensor, "batch unknowns"]:
+            return warm + self.space.expand(points.to(warm.dtype), request.context.frames).flatten(1)
+
+        def energy(points: Float[Tensor, "batch size"]) -> Float[Tensor, " batch"]:
+            noise = unknowns(points)
+            with torch.no_grad():
+                return Objective(LatentNoise.from_unknowns(request.context, noise).build, request.terms).energy(noise)
+
+        start, spread = torch.zeros(self.space.size()), self.space.spread
+        found = run_swarm(
+            energy, start=start, spread=spread, settings=self.settings, meter=meter, generator=request.generator
+        )
+        return unknowns(found.x[None])
 
 
 @dataclass(frozen=True, eq=False)

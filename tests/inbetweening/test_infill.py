@@ -20,12 +20,13 @@ from mapctl import contacts, retarget, rotations
 from mapctl.errors import RequestError
 from mapctl.inbetweening import GapQuery, PositionImage, Proposal, ProposedPositions
 from mapctl.inbetweening.missing import interpolate_missing
+from mapctl.inbetweening.position_image import propose_from_positions
 from mapctl.inbetweening.query import estimate_contact_logits
 from mapctl.inbetweening.root_trajectory import close_path
 from mapctl.intent.keyframes import Keys
 from mapctl.motion import Motion
 from mapctl.numerics.smooth_offsets import blend_seams_in_positions, blend_seams_in_rotations
-from mapctl.protocols import Inbetweener, PositionInfiller
+from mapctl.protocols import Inbetweener
 from mapctl.recording.masks import ALL, ROOT, Mask, MissingMask, restore_observed
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, leg_length
 
@@ -95,10 +96,13 @@ def test_what_stands_in_the_gap_does_not_matter(rig, method):
 
 
 @dataclass(frozen=True)
-class Oracle(PositionInfiller):
+class Oracle(Inbetweener):
     """Knows the motion."""
 
     truth: Motion
+
+    def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
+        return propose_from_positions(query, self.complete, "oracle")
 
     def complete(self, image: PositionImage) -> ProposedPositions:
         """The true places; where there is a moment more than at 30 a second it is that of the very end."""

@@ -15,7 +15,7 @@ from mapctl.kinematics import heading
 from mapctl.metrics.feet import locate_heels
 from mapctl.pose import decode
 from mapctl.problem.solution import Outcome
-from mapctl.problem.window_solvers import BestOfSamples, LatentNoiseSolver, SwarmProposal
+from mapctl.problem.window_solvers import LatentNoiseSolver, SwarmProposal
 from mapctl.skeleton import CANONICAL, FEET
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
@@ -29,8 +29,8 @@ def solve(frames=20, *, method=METHOD, density=DENSITY, seed=0, **limits):
 
 METHODS = {
     "zero start": METHOD,
-    "best of": replace(METHOD, proposal=BestOfSamples(count=4)),
-    "swarm": replace(METHOD, proposal=SwarmProposal(SwarmSettings(particles=4, iterations=1))),
+    "best of": replace(METHOD, proposal=SwarmProposal(SwarmSettings(particles=4, iterations=1))),
+    "swarm": replace(METHOD, proposal=SwarmProposal(SwarmSettings(particles=4, iterations=2))),
 }
 
 
