@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -71,6 +71,21 @@ class InfillSettings:
     """Whether MAP refines the proposal; if not it stays as proposed, on rigid bones and with exact keys."""
     refinement: RefinementSettings = field(default_factory=lambda: INFILL_REFINEMENT)
     """Sigmas and search of the MAP stage."""
+
+
+class FillOptions(TypedDict, total=False):
+    """Options of every job that fills gaps."""
+
+    settings: InfillSettings | None
+    """Whether and how MAP refines the proposal."""
+    densities: Sequence[Density]
+    """Densities of which the likeliest joins the MAP stage."""
+    terms: Sequence[Term]
+    """Terms that join the MAP stage."""
+    rig: Rig | None
+    """The motion's rig, where it is not the one that would be recognised."""
+    generator: torch.Generator | None
+    """Source of all random draws; one with seed 0 if not given."""
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -143,27 +158,23 @@ def fill(
     missing: MissingMask,
     inbetweener: Inbetweener,
     *,
-    settings: InfillSettings | None = None,
-    densities: Sequence[Density] = (),
-    terms: Sequence[Term] = (),
-    rig: Rig | None = None,
     targets: EffectorTargets | None = None,
     loose: LooseKeys | None = None,
     curve: Curve | None = None,
-    generator: torch.Generator | None = None,
+    **options: Unpack[FillOptions],
 ) -> InbetweenSolution:
     """Fill missing values of a motion.
 
     `targets` are positions of the rig's hands and feet in frames in which they are missing, `loose` positions over the
-    ground and drawings in such frames; the hips follow `curve` while they are missing. The MAP stage adds `terms`, and
-    the likeliest of `densities` its likelihood; RequestError for terms where it is left out.
+    ground and drawings in such frames; the hips follow `curve` while they are missing. RequestError for terms where the
+    MAP stage is left out.
     """
-    settings, began = settings or InfillSettings(), time.perf_counter()
-    if terms and not settings.refine:
+    settings, began = options.get("settings") or InfillSettings(), time.perf_counter()
+    if options.get("terms") and not settings.refine:
         raise RequestError("terms belong to the MAP stage, which is left out")
-    generator = generator or torch.Generator().manual_seed(0)
+    generator = options.get("generator") or torch.Generator().manual_seed(0)
     # The query: the clip at the prior's rate on canonical joints, led along what is requested.
-    clip = CanonicalClip.of(motion, missing, rig)
+    clip = CanonicalClip.of(motion, missing, options.get("rig"))
     if curve is not None:
         clip = replace(clip, canonical=_lead_along_curve(clip.canonical, missing.root, curve))
     if loose is not None:
@@ -202,9 +213,9 @@ def fill(
                 sigma_root=0.0,
             ),
             settings.refinement,
-            densities=densities,
+            densities=options.get("densities", ()),
             targets=None if reached is None else EffectorTargets(reached.positions[part], reached.wanted[part]),
-            terms=terms,
+            terms=options.get("terms", ()),
             first_frame=first,
             trust=None if trust is None else trust[part],
         )

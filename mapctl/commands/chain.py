@@ -44,13 +44,13 @@ def run(command: Chain) -> int:
     options.check_seed(command.seed)
     results.check_proposal(command)
     results.check_destinations(command.out, command.video, given=command.clips)
-    settings = ChainSettings(piece=command.piece, gap=_parse_gap(command))
+    lengths = ChainSettings(piece=command.piece, gap=_parse_gap(command))
     rig = inputs.read_rig(command.rig, command)
     done = chain(
         [inputs.read_motion(path, rig, quiet=command.quiet) for path in command.clips],
         build_inbetweener(command.method, results.load_models(command)),
-        settings=settings,
-        filling=InfillSettings(refine=not command.no_refine),
+        lengths=lengths,
+        settings=InfillSettings(refine=not command.no_refine),
         rig=rig,
         generator=torch.Generator().manual_seed(command.seed),
     )

@@ -191,7 +191,7 @@ class RecedingHorizonSolver:
             features=torch.cat([done.features, features]),
             joints_world=torch.cat([done.joints_world, window.trial.joints_world[0, :count]])[-self.settings.past :],
             warm_start=window.warm_start[count:],
-            ledger=done.ledger.join(window.ledger.slice(count)),
+            ledger=done.ledger.join(window.ledger.pick(slice(count))),
             windows=(*done.windows, record),
             forecast=window.trial.joints_world[0, count:],
             discarded=done.discarded,

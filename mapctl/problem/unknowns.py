@@ -65,10 +65,6 @@ class WindowContext:
         assert not isinstance(self.state, tuple)
         return self.state
 
-    def expand_state(self, batch: int) -> DensityState:
-        """Expand the one density's state to a batch of candidates."""
-        return self.prior_state.expand(batch)
-
     def build_trial(
         self,
         features: Float[Tensor, "batch frames size"],
@@ -127,13 +123,13 @@ class LatentNoise(Parametrisation):
     def from_unknowns(context: WindowContext, unknowns: Float[Tensor, "batch unknowns"]) -> "LatentNoise":
         """Plan the likeliest components and contact bits along the rollout of the unknowns."""
         noise = torch.unflatten(unknowns.detach(), -1, (context.frames, LAYOUT.continuous))
-        return LatentNoise(context, context.prior.plan(context.expand_state(len(noise)), noise))
+        return LatentNoise(context, context.prior.plan(context.prior_state.expand(len(noise)), noise))
 
     @staticmethod
     def begin_search(context: WindowContext, start: Float[Tensor, "batch unknowns"]) -> "LatentNoise":
         """Plan like `from_unknowns`, for a search that evaluates the start first: its rollout is done only once."""
         noise = torch.unflatten(start.detach(), -1, (context.frames, LAYOUT.continuous))
-        planned = context.prior.plan_search(context.expand_state(len(noise)), noise)
+        planned = context.prior.plan_search(context.prior_state.expand(len(noise)), noise)
         return LatentNoise(context, *planned, holds_heels=True)
 
     def build(self, unknowns: Float[Tensor, "batch unknowns"]) -> Trial:
@@ -141,7 +137,7 @@ class LatentNoise(Parametrisation):
         context = self.context
         noise = torch.unflatten(unknowns, -1, (context.frames, LAYOUT.continuous))
         plan = self._expand_plan(len(noise))
-        features, log_density = context.prior.rollout(context.expand_state(len(noise)), noise, plan)
+        features, log_density = context.prior.rollout(context.prior_state.expand(len(noise)), noise, plan)
         return self._hold_heels(context.build_trial(features, plan.contacts, noise, log_density))
 
     def build_detached(self, unknowns: Float[Tensor, "batch unknowns"]) -> Trial | None:
@@ -169,7 +165,7 @@ class LatentNoise(Parametrisation):
         """Prepare the rollouts of so many candidates, once, and their contacts."""
         if batch not in self._prepared:
             plan = self._expand_plan(batch)
-            rollout = self.context.prior.prepare_rollout(self.context.expand_state(batch), plan)
+            rollout = self.context.prior.prepare_rollout(self.context.prior_state.expand(batch), plan)
             self._prepared[batch] = rollout, plan.contacts
         return self._prepared[batch]
 
@@ -200,6 +196,10 @@ class LatentNoise(Parametrisation):
         return torch.unflatten(unknowns[0], -1, (self.context.frames, LAYOUT.continuous))
 
 
+SMOOTH_FRAMES = 2.0
+"""Frames (sigma) over which offsets are smoothed: what moves one frame moves its neighbours along."""
+
+
 @dataclass(frozen=True, eq=False)
 class PoseOffsets(Parametrisation):
     """Unknowns are offsets about a proposal's root position, heading and angles, one batch row a candidate."""
@@ -212,8 +212,6 @@ class PoseOffsets(Parametrisation):
     """Left and right toe planted in each frame."""
     sigma: Float[Tensor, "frames width"]
     """Standard deviations of root, heading and angles (see `BodyPose.pack`): metres and radians."""
-    smooth: float = 2.0
-    """Sigma of the smoothing, frames."""
 
     @cached_property
     def _heel_plan(self) -> Trial:
@@ -223,7 +221,7 @@ class PoseOffsets(Parametrisation):
 
     @cached_property
     def _smoothing_matrix(self) -> Float[Tensor, "frames frames"]:
-        return gaussian.unit_variance_matrix(len(self.sigma), self.smooth, self.sigma.dtype)
+        return gaussian.unit_variance_matrix(len(self.sigma), SMOOTH_FRAMES, self.sigma.dtype)
 
     def build(self, unknowns: Float[Tensor, "batch unknowns"]) -> Trial:
         """Build the trials of the proposal with the offsets added; differentiable."""
@@ -233,7 +231,7 @@ class PoseOffsets(Parametrisation):
         features = pose.features(self.context.ground_pose, self.contacts)
         log_density = None
         if not isinstance(self.context.density, DensityEnsemble):
-            log_density = self.context.density.log_prob(features, self.context.expand_state(len(white)))
+            log_density = self.context.density.log_prob(features, self.context.prior_state.expand(len(white)))
         contacts = self.contacts.expand(len(white), -1, -1)
         return replace(self.context.build_trial(features, contacts, white, log_density), heel_plan=self._heel_plan)
 

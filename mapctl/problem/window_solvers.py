@@ -26,6 +26,9 @@ from mapctl.terms.base import Term
 from mapctl.terms.likelihood import LatentPrior, Likelihood
 from mapctl.terms.trial import Trial
 
+_STUCK_ENERGY = 8.0
+"""Energy a frame, nats, below which no further round is run: a new round starts without curvature pairs, which pays
+only where the last one is stuck."""
 WarmStartProposal = Callable[[WindowRequest, Float[Tensor, "1 unknowns"], Meter], Float[Tensor, "1 unknowns"]]
 """(request, warm start over the whole window, meter) to the unknowns from which L-BFGS starts."""
 
@@ -129,9 +132,6 @@ class LatentNoiseSolver:
 
     rounds: int = 3
     """Largest number of rounds."""
-    energy_threshold: float = 8.0
-    """Energy a frame, nats, below which no further round is run: a new round starts without curvature pairs, which pays
-    only where the last one is stuck."""
     lbfgs: LbfgsSettings = field(
         default_factory=lambda: LbfgsSettings(max_iterations=36, relative_energy_tolerance=3e-3)
     )
@@ -149,7 +149,7 @@ class LatentNoiseSolver:
         unknowns, best = self._run_round(request, start, meter)
         start_energy = float(best.start_energy[0])
         for _ in range(self.rounds - 1):
-            if meter.exhausted or not best.energy[0] > self.energy_threshold * frames:
+            if meter.exhausted or not best.energy[0] > _STUCK_ENERGY * frames:
                 break
             replanned, again = self._run_round(request, best.x, meter)
             if not again.energy[0] < best.energy[0]:
@@ -244,8 +244,6 @@ class PoseOffsetSolver:
     """Left and right toe planted in each frame of it."""
     sigma: Float[Tensor, "frames width"]
     """Standard deviations of root, heading and angles by frame (see `BodyPose.pack`): metres and radians."""
-    smooth: float = 2.0
-    """Sigma of the smoothing, frames."""
     temperature: float = 1.0
     """Temperature of the selected density's likelihood."""
     lbfgs: LbfgsSettings = field(default_factory=lambda: LbfgsSettings(max_iterations=20))
@@ -270,6 +268,6 @@ class PoseOffsetSolver:
             choice, state = context.density.select(proposal.features(context.ground_pose, contacts), context.state)
             context = replace(context, density=choice.density, state=state)
             terms = (*terms, Likelihood(self.temperature / choice.weight))
-        offsets = PoseOffsets(context, proposal, contacts, self.sigma[first:stop], smooth=self.smooth)
+        offsets = PoseOffsets(context, proposal, contacts, self.sigma[first:stop])
         start, meter = torch.zeros(1, offsets.sigma.numel()), Meter(self.budget.within(request.seconds))
         return replace(minimise_window(offsets, terms, start, self.lbfgs, meter), choice=choice)

@@ -20,24 +20,21 @@ from torch import Tensor
 
 from mapctl.solver.budget import Meter
 
+_WEIGHTS = {"w": 0.7298, "c1": 1.4962, "c2": 1.4962}
+"""Share of its velocity that a particle keeps, and its pull toward its own best point and the best of all: largest
+factors of the difference in an iteration (the constriction of Clerc and Kennedy 2002)."""
 Cost = Callable[[Tensor], Tensor]
 """Points (particles, n) to energies (particles,); what is not finite counts as infinity."""
 
 
 @dataclass(frozen=True)
 class SwarmSettings:
-    """Size and weights of a swarm; the default weights are the constriction of Clerc and Kennedy 2002."""
+    """Size of a swarm."""
 
     particles: int = 16
     """Number of points evaluated at once; fewer where the budget has fewer left."""
     iterations: int = 6
     """Number of evaluations of the whole swarm; of one evaluation the best sample is the result."""
-    inertia: float = 0.7298
-    """Share of its velocity a particle keeps."""
-    cognitive: float = 1.4962
-    """Pull toward the particle's own best point: largest factor of the difference, each iteration."""
-    social: float = 1.4962
-    """Pull toward the best point of all: largest factor of the difference, each iteration."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +71,8 @@ def run_swarm(
         return track.result()
     seed = torch.randint(2**32, (8,), generator=generator, device=generator.device).cpu().numpy()
     random, (operators, make_swarm) = np.random.RandomState(seed), _import_pyswarms()
-    first, weights = _to_numpy(points), {"w": settings.inertia, "c1": settings.cognitive, "c2": settings.social}
-    swarm = make_swarm(first, np.zeros_like(first), options=weights)
+    first = _to_numpy(points)
+    swarm = make_swarm(first, np.zeros_like(first), options=_WEIGHTS)
     swarm.pbest_cost, swarm.best_pos, swarm.best_cost = np.full(len(first), np.inf), first[0], np.inf
     for _ in range(settings.iterations - 1):
         swarm.current_cost = costs

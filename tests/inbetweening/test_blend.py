@@ -84,9 +84,9 @@ def others_walk() -> Motion:
 
 
 def test_pieces_of_a_chain_stand_on_the_first_ones_floor():
-    settings = ChainSettings(piece=40, gap=(10, 10))
+    lengths = ChainSettings(piece=40, gap=(10, 10))
     done = chain(
-        [own_walk(), others_walk()], SlerpInbetweener(), settings=settings, filling=UNFINISHED, generator=generator()
+        [own_walk(), others_walk()], SlerpInbetweener(), lengths=lengths, settings=UNFINISHED, generator=generator()
     )
     toes = retarget.to_canonical(done.motion)[0].joint_positions()[:, TOES, 1]
     for piece in (slice(0, 40), slice(50, 90)):

@@ -12,8 +12,8 @@ from tiny_infiller import tiny_infiller
 from tiny_path import ToldPath, tiny_path
 
 from controllers import retraced
-from controllers.inbetweening.infill import InfillSettings, infill
-from controllers.inbetweening.pipeline import CanonicalClip, take_simpler
+from controllers.inbetweening.infill import infill
+from controllers.inbetweening.pipeline import CanonicalClip, InfillSettings, take_simpler
 from controllers.inbetweening.proposers import STANDING_STILL, AutoInbetweener, SlerpInbetweener, hold_planted
 from controllers.inbetweening.tween import tween
 from mapctl import contacts, retarget, rotations

@@ -80,7 +80,7 @@ JOBS = {
     "chain": lambda terms: chain(
         [WALKER, WALKER],
         LinearInbetweener(),
-        settings=ChainSettings(piece=12, gap=(12, 12)),
+        lengths=ChainSettings(piece=12, gap=(12, 12)),
         generator=generator(),
         terms=terms,
     ),

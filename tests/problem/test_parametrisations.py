@@ -59,7 +59,7 @@ def test_the_ledger_adds_up_to_the_energy_and_names_every_term():
     assert [(e.name, e.unit) for e in ledger.entries] == [(t.name, t.unit) for t in terms]
     total = sum(entry.energy.sum() for entry in ledger.entries)
     torch.testing.assert_close(total, objective.energy(unknowns)[0])
-    joined = ledger.slice(3).join(ledger)
+    joined = ledger.pick(slice(3)).join(ledger)
     assert all(len(entry.energy) == len(entry.residual) == 3 + FRAMES for entry in joined.entries)
     row = joined.summary()["noise"]
     assert row["energy_nats"] == pytest.approx(float(joined.entries[0].energy.sum()))
