@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from controllers.inbetweening.infill import chain as chain
     from controllers.inbetweening.infill import infill as infill
     from controllers.inbetweening.infill import retraced as retraced
-    from controllers.inbetweening.pipeline import InfillSettings as InfillSettings
+    from controllers.inbetweening.pipeline import INFILL_REFINEMENT as INFILL_REFINEMENT
     from controllers.inbetweening.proposers import AutoInbetweener as AutoInbetweener
     from controllers.inbetweening.proposers import RolloutInbetweener as RolloutInbetweener
     from controllers.inbetweening.proposers import SlerpInbetweener as SlerpInbetweener
@@ -32,7 +32,7 @@ _NAMES = {
     "controllers.generation.generate": ("GenerateSettings", "generate"),
     "controllers.inbetweening.blend": ("blend",),
     "controllers.inbetweening.infill": ("chain", "infill", "retraced"),
-    "controllers.inbetweening.pipeline": ("InfillSettings",),
+    "controllers.inbetweening.pipeline": ("INFILL_REFINEMENT",),
     "controllers.inbetweening.proposers": ("AutoInbetweener", "RolloutInbetweener", "SlerpInbetweener"),
     "controllers.inbetweening.tween": ("tween",),
     "mapctl.intent.keyframes": ("Drawing", "Key", "Keys"),

@@ -156,7 +156,7 @@ class InfillerNetwork(nn.Module):
     def forward(self, image: PositionImage) -> ProposedPositions:
         """Fill an image; ours keeps known positions to the bit, an autoencoder makes all anew (section 4.2)."""
         # Joints that are never known are shown at their mean.
-        shown = torch.where(image.ever_known[:, None, :, None], image.positions, self.mean)
+        shown = torch.where(image.known.any(dim=1)[:, None, :, None], image.positions, self.mean)
         rows = self._rows(image, shown)
         if self.keeps_observed:
             # Which joints are known, and how many frames ago and ahead any is, as a share of those that matter.

@@ -118,33 +118,23 @@ def retraced(
 _VELOCITY_FRAMES = 5  # frames over which the velocity at a piece's end is estimated
 
 
-@dataclass(frozen=True)
-class ChainSettings:
-    """Lengths of pieces and gaps, frames at the prior's rate."""
-
-    piece: int = 40
-    """Frames of a piece, from the middle of every clip; a shorter clip is taken whole."""
-    gap: tuple[int, int] = (50, 100)
-    """Fewest and most frames of a gap, sampled uniformly."""
-
-    def __post_init__(self):
-        if self.piece < 2 or not 1 <= self.gap[0] <= self.gap[1] <= 900:
-            raise RequestError(f"pieces need 2 frames or more and gaps 1 to 900, got {self.piece} and {self.gap}")
-
-
 def chain(
     clips: Sequence[Motion],
     inbetweener: Inbetweener,
     *,
-    lengths: ChainSettings | None = None,
+    piece: int = 40,
+    gap: tuple[int, int] = (50, 100),
     **options: Unpack[FillOptions],
 ) -> InbetweenSolution:
     """Chain pieces of clips to a motion on the first clip's rig at PRIOR_FPS. RequestError for fewer than two clips.
 
-    Each piece is aligned to the one before: the trajectory goes on at its velocity for half of the gap, then at the
-    next one's. The generator samples the gaps' lengths, then is the in-betweener's. `rig` is that of all clips.
+    Of every clip `piece` frames are taken, from its middle, or all of a shorter one. Each piece is aligned to the one
+    before: the trajectory goes on at its velocity for half of the gap, then at the next one's. The generator samples
+    each gap's frames, from the fewest to the most of `gap`, then is the in-betweener's. `rig` is that of all clips.
     """
-    lengths, rig = lengths or ChainSettings(), options.get("rig")
+    if piece < 2 or not 1 <= gap[0] <= gap[1] <= 900:
+        raise RequestError(f"pieces need 2 frames or more and gaps 1 to 900, got {piece} and {gap}")
+    rig = options.get("rig")
     options["generator"] = generator = options.get("generator") or torch.Generator().manual_seed(0)
     if len(clips) < 2:
         raise RequestError(f"a chain needs at least two clips, got {len(clips)}")
@@ -155,17 +145,16 @@ def chain(
         retargeted = retarget_motion(clip, body, rig)
         notes += retargeted.notes
         motion = retargeted.motion.resample(PRIOR_FPS)
-        count = min(lengths.piece, motion.num_frames)
+        count = min(piece, motion.num_frames)
         start = (motion.num_frames - count) // 2
-        piece = replace(motion.slice(start, start + count), source=None)
+        excerpt = replace(motion.slice(start, start + count), source=None)
         if whole is None:
-            whole = piece
+            whole = excerpt
             continue
-        gap = int(torch.randint(lengths.gap[0], lengths.gap[1] + 1, (), generator=generator))
-        masks.append(Mask(ALL, whole.num_frames, whole.num_frames + gap))
-        piece = _align_to_predecessor(whole, piece, gap)
-        held = whole.pick(torch.full((gap,), whole.num_frames - 1))
-        whole = whole.join(held).join(piece)
+        frames = int(torch.randint(gap[0], gap[1] + 1, (), generator=generator))
+        masks.append(Mask(ALL, whole.num_frames, whole.num_frames + frames))
+        held = whole.pick(torch.full((frames,), whole.num_frames - 1))
+        whole = whole.join(held).join(_align_to_predecessor(whole, excerpt, frames))
     assert whole is not None, "there are clips"
     done = infill(body.on_rig(whole), inbetweener, masks, **options)
     return replace(done, status=done.status.with_notes(notes))

@@ -63,21 +63,12 @@ network's, since styles differ in them, except those of toes that skate; a jerk 
 error of a gap."""
 
 
-@dataclass(frozen=True)
-class InfillSettings:
-    """Settings of in-betweening."""
-
-    refine: bool = True
-    """Whether MAP refines the proposal; if not it stays as proposed, on rigid bones and with exact keys."""
-    refinement: RefinementSettings = field(default_factory=lambda: INFILL_REFINEMENT)
-    """Sigmas and search of the MAP stage."""
-
-
 class FillOptions(TypedDict, total=False):
     """Options of every job that fills gaps."""
 
-    settings: InfillSettings | None
-    """Whether and how MAP refines the proposal."""
+    refinement: RefinementSettings | None
+    """How MAP refines the proposal, as by INFILL_REFINEMENT if not given; None leaves it as proposed, on rigid bones
+    and with exact keys."""
     densities: Sequence[Density]
     """Densities of which the likeliest joins the MAP stage."""
     terms: Sequence[Term]
@@ -169,8 +160,8 @@ def fill(
     ground and drawings in such frames; the hips follow `curve` while they are missing. RequestError for terms where the
     MAP stage is left out.
     """
-    settings, began = options.get("settings") or InfillSettings(), time.perf_counter()
-    if options.get("terms") and not settings.refine:
+    refinement, began = options.get("refinement", INFILL_REFINEMENT), time.perf_counter()
+    if options.get("terms") and refinement is None:
         raise RequestError("terms belong to the MAP stage, which is left out")
     generator = options.get("generator") or torch.Generator().manual_seed(0)
     # The query: the clip at the prior's rate on canonical joints, led along what is requested.
@@ -196,9 +187,9 @@ def fill(
     unknown = MissingMask(query.missing.joints, unknown_root)
     spread = answer.spread
     trust = None if spread is None else (spread[..., 0] / _USUAL_ERROR).clamp(*_TRUST_RANGE).float()
-    near = widen(unknown.frames, _CONTEXT_FRAMES) & settings.refine  # gaps whose contexts overlap are one window
+    near = widen(unknown.frames, _CONTEXT_FRAMES)  # gaps whose contexts overlap are one window
     for _, first, last in true_intervals(near[:, None]):
-        if last - first < 2:
+        if refinement is None or last - first < 2:
             continue
         part, part_unknown = slice(first, last), unknown.slice(first, last)
         proposal = canonical.slice(first, last)
@@ -212,7 +203,7 @@ def fill(
                 sigma=torch.zeros(CANONICAL.num_joints),
                 sigma_root=0.0,
             ),
-            settings.refinement,
+            refinement,
             densities=options.get("densities", ()),
             targets=None if reached is None else EffectorTargets(reached.positions[part], reached.wanted[part]),
             terms=options.get("terms", ()),
@@ -222,7 +213,7 @@ def fill(
         quats[part] = torch.where(part_unknown.joints[..., None], refined.motion.local_quat_xyzw, quats[part])
         root[part] = torch.where(part_unknown.root[:, None], refined.motion.root_position, root[part])
         ledger, windows = ledger.join(refined.ledger), (*windows, *refined.windows)
-    if settings.refine:
+    if refinement is not None:
         canonical = replace(canonical, root_position=root, local_quat_xyzw=quats)
     # The result on the rig: seams, then targets and positions to the millimetre.
     done, unreached = _reach_targets(clip, clip.back(canonical, asked), targets)

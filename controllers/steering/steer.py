@@ -465,7 +465,8 @@ def _relax_footing_first(
         request = replace(request, seconds=request.seconds / 2)
         first = relaxed(replace(request, terms=others))
         second = half(replace(request, warm_start=first.warm_start))
-        return replace(second, evaluations=first.evaluations + second.evaluations)
+        spent = first.record.evaluations + second.record.evaluations
+        return replace(second, record=replace(second.record, evaluations=spent))
 
     return solve
 

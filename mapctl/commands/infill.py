@@ -9,7 +9,7 @@ from tyro.conf import UseAppendAction, arg
 
 import priors
 from controllers.inbetweening.infill import infill, retraced
-from controllers.inbetweening.pipeline import FillOptions, InbetweenSolution, InfillSettings
+from controllers.inbetweening.pipeline import INFILL_REFINEMENT, FillOptions, InbetweenSolution
 from controllers.inbetweening.proposers import build_inbetweener
 from mapctl import curves
 from mapctl.commands.shared import inputs, options, results
@@ -100,7 +100,7 @@ def _run_infilling(
     command: Infill, motion: Motion, masks: Sequence[Mask], ways: Sequence[Mask], rig: Rig | None
 ) -> InbetweenSolution:
     shared = FillOptions(
-        settings=InfillSettings(refine=not command.no_refine),
+        refinement=None if command.no_refine else INFILL_REFINEMENT,
         densities=priors.load_choice(command.prior),
         rig=rig,
         generator=torch.Generator().manual_seed(command.seed),

@@ -66,7 +66,7 @@ class CommittedFrames:
     joints_world: Float[Tensor, "past joints 3"]
     """World joint positions of the last frames, metres, oldest first."""
     warm_start: Float[Tensor, "ahead width"] = field(default_factory=lambda: torch.zeros(0, LAYOUT.continuous))
-    """Warm start of the next window: what the last one found for its look-ahead (see `Parametrisation`)."""
+    """Warm start of the next window: what the last one found for its look-ahead (see `SolvedWindow`)."""
     ledger: Ledger = field(default_factory=Ledger)
     """Energy and residual of the solved frames."""
     windows: tuple[WindowRecord, ...] = ()
@@ -182,9 +182,6 @@ class RecedingHorizonSolver:
         """Commit the first frames of a window that took so many seconds."""
         features = window.trial.features[0, :count]
         ground, heading = integrate_root(features, done.ground_pose)
-        record = WindowRecord(
-            count, seconds, window.evaluations, window.start_energy, window.energy, window.stop_reason, window.choice
-        )
         return CommittedFrames(
             state=self.density.advance(done.state, features.unsqueeze(0)),
             ground_pose=GroundPose(ground[-1], heading[-1]),
@@ -192,7 +189,7 @@ class RecedingHorizonSolver:
             joints_world=torch.cat([done.joints_world, window.trial.joints_world[0, :count]])[-self.settings.past :],
             warm_start=window.warm_start[count:],
             ledger=done.ledger.join(window.ledger.pick(slice(count))),
-            windows=(*done.windows, record),
+            windows=(*done.windows, replace(window.record, frames=count, seconds=seconds)),
             forecast=window.trial.joints_world[0, count:],
             discarded=done.discarded,
         )

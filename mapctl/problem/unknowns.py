@@ -96,7 +96,7 @@ class WindowRequest:
     terms: Sequence[Term]
     """Terms whose energies are summed over the window's frames."""
     warm_start: Float[Tensor, "ahead width"]
-    """Result of the last window for the first of these frames (see `Parametrisation.warm_start`); none at the start.
+    """Result of the last window for the first of these frames (see `SolvedWindow`); none at the start.
     """
     generator: torch.Generator
     """Source of all random draws."""
@@ -191,10 +191,6 @@ class LatentNoise(Parametrisation):
             self.plan.component.expand(batch, -1).contiguous(), self.plan.contacts.expand(batch, -1, -1).contiguous()
         )
 
-    def warm_start(self, unknowns: Float[Tensor, "1 unknowns"]) -> Float[Tensor, "frames width"]:
-        """Return the noise by frame."""
-        return torch.unflatten(unknowns[0], -1, (self.context.frames, LAYOUT.continuous))
-
 
 SMOOTH_FRAMES = 2.0
 """Frames (sigma) over which offsets are smoothed: what moves one frame moves its neighbours along."""
@@ -234,7 +230,3 @@ class PoseOffsets(Parametrisation):
             log_density = self.context.density.log_prob(features, self.context.prior_state.expand(len(white)))
         contacts = self.contacts.expand(len(white), -1, -1)
         return replace(self.context.build_trial(features, contacts, white, log_density), heel_plan=self._heel_plan)
-
-    def warm_start(self, unknowns: Float[Tensor, "1 unknowns"]) -> Float[Tensor, "frames width"]:
-        """Return the white offsets by frame, in sigmas."""
-        return torch.unflatten(unknowns[0], -1, self.sigma.shape)

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from mapctl.features import LAYOUT
 from mapctl.pose import BodyPose
-from mapctl.problem.density_selection import DensityChoice, DensityEnsemble
+from mapctl.problem.density_selection import DensityEnsemble
 from mapctl.problem.objective import Objective, Parametrisation
-from mapctl.problem.solution import Ledger
+from mapctl.problem.solution import Ledger, WindowRecord
 from mapctl.problem.unknowns import LatentNoise, PoseOffsets, WindowRequest
 from mapctl.solver.budget import Budget, Meter
 from mapctl.solver.lbfgs import LbfgsResult, LbfgsSettings, minimise
@@ -103,19 +103,11 @@ class SolvedWindow:
     trial: Trial
     """Motion found: batch of one, detached."""
     warm_start: Float[Tensor, "frames width"]
-    """Warm start of the next window, by frame (see `Parametrisation.warm_start`)."""
+    """Unknowns by frame, from which the next window, which overlaps this one, may start."""
     ledger: Ledger
     """Energy and residual by term and frame."""
-    evaluations: int
-    """Number of evaluations, those of warm start proposals included."""
-    start_energy: float
-    """Energy at the start of L-BFGS, nats."""
-    energy: float
-    """Energy of the trial, nats."""
-    stop_reason: str
-    """Reason why L-BFGS stopped."""
-    choice: DensityChoice | None = None
-    """Density of an ensemble that scored the window; None for a single density."""
+    record: WindowRecord
+    """Cost and energies, of all frames; the horizon sets the seconds."""
 
 
 SingleWindowSolver: TypeAlias = Callable[[WindowRequest], SolvedWindow]
@@ -155,7 +147,8 @@ class LatentNoiseSolver:
             if not again.energy[0] < best.energy[0]:
                 break
             unknowns, best = replanned, again
-        return replace(_build_solved_window(unknowns, request.terms, best, meter), start_energy=start_energy)
+        solved = _build_solved_window(unknowns, request.terms, best, meter)
+        return replace(solved, record=replace(solved.record, start_energy=start_energy))
 
     def _run_round(self, request: WindowRequest, start: Tensor, meter: Meter) -> tuple[LatentNoise, LbfgsResult]:
         unknowns = LatentNoise.begin_search(request.context, start)
@@ -219,14 +212,12 @@ def _build_solved_window(
 ) -> SolvedWindow:
     objective = Objective.of(unknowns, terms)
     trial = objective.build_detached(result.x)
+    frames, energies = trial.features.shape[1], (float(result.start_energy[0]), float(result.energy[0]))
     return SolvedWindow(
         trial,
-        unknowns.warm_start(result.x),
+        torch.unflatten(result.x[0], -1, (frames, -1)),
         objective.build_ledger(trial),
-        meter.evaluations,
-        float(result.start_energy[0]),
-        float(result.energy[0]),
-        result.status[0].value,
+        WindowRecord(frames, 0.0, meter.evaluations, *energies, outcome=result.status[0].value),
     )
 
 
@@ -270,4 +261,5 @@ class PoseOffsetSolver:
             terms = (*terms, Likelihood(self.temperature / choice.weight))
         offsets = PoseOffsets(context, proposal, contacts, self.sigma[first:stop])
         start, meter = torch.zeros(1, offsets.sigma.numel()), Meter(self.budget.within(request.seconds))
-        return replace(minimise_window(offsets, terms, start, self.lbfgs, meter), choice=choice)
+        solved = minimise_window(offsets, terms, start, self.lbfgs, meter)
+        return replace(solved, record=replace(solved.record, choice=choice))

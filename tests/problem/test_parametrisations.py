@@ -88,7 +88,7 @@ PARAMETRISATIONS = parametrisations()
 
 @pytest.mark.parametrize("name", PARAMETRISATIONS)
 def test_every_parametrisation_keeps_its_contract(name):
-    """Trials of candidates that are independent, their gradient, and what the next window starts from."""
+    """Trials of candidates that are independent, and their gradient."""
     unknowns, begin = PARAMETRISATIONS[name]
     assert isinstance(unknowns, Parametrisation)
     points = begin + 0.3 * torch.randn(3, begin.shape[1], generator=generator(4), dtype=torch.float64)
@@ -98,7 +98,6 @@ def test_every_parametrisation_keeps_its_contract(name):
     alone = unknowns.build(points[1:2])
     torch.testing.assert_close(alone.features[0], trial.features[1])
     torch.testing.assert_close(alone.log_density[0], trial.log_density[1])
-    assert len(unknowns.warm_start(points[:1])) == FRAMES
     energy = Objective(unknowns.build, (LatentPrior(), Likelihood(), FootContact())).energy
     direction = torch.randn(points.shape, generator=generator(5), dtype=torch.float64)
     wanted = finite_difference(lambda at: energy(at).sum(), points, direction)

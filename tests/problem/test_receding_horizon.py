@@ -39,9 +39,9 @@ def test_a_window_ends_lower_than_it_began_within_its_budget(name):
     terms = (*terms_of(1, SHORT.frames), Likelihood())
     begun = BEGUN
     solved = METHODS[name](request(begun, terms))
-    assert solved.energy < solved.start_energy
-    assert solved.evaluations <= 12
-    assert sum(float(e.energy.sum()) for e in solved.ledger.entries) == pytest.approx(solved.energy, rel=1e-4)
+    assert solved.record.energy < solved.record.start_energy
+    assert solved.record.evaluations <= 12
+    assert sum(float(e.energy.sum()) for e in solved.ledger.entries) == pytest.approx(solved.record.energy, rel=1e-4)
     assert solved.warm_start.shape[0] == SHORT.frames
     assert not solved.trial.features.requires_grad
 
