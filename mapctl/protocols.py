@@ -244,11 +244,6 @@ class Density(Protocol[State]):
         return self.start_after(features[:1])
 
     @property
-    def feature_mean(self) -> Float[Tensor, " size"]:
-        """Mean of the training data, physical units: where searches over features begin. Default: zeros."""
-        return torch.zeros(LAYOUT.size)
-
-    @property
     def feature_std(self) -> Float[Tensor, " size"]:
         """Physical size of the unit in which `log_prob` takes each feature. Default: ones, physical units."""
         return torch.ones(LAYOUT.size)
@@ -280,10 +275,6 @@ class Density(Protocol[State]):
     def conditioned_like_start(self, start: int) -> "Density[State]":
         """Return the density given the labels of the clip that an initial state, of the index `start`, was taken from.
         Default: itself."""
-        return self
-
-    def conditioned_like_clip(self, name: str) -> "Density[State]":
-        """Return the density given the labels in a clip's path. Default: itself."""
         return self
 
     @property

@@ -43,7 +43,7 @@ from mapctl.numerics.smooth_offsets import interpolate_offsets, interpolate_turn
 from mapctl.pose import decode
 from mapctl.problem import density_selection
 from mapctl.problem.receding_horizon import CommittedFrames, RecedingHorizonSolver, replay
-from mapctl.problem.window_solvers import LatentNoiseSolver, SolvedWindow, SteeringKnots, SwarmProposal, keep_warm_start
+from mapctl.problem.window_solvers import LatentNoiseSolver, SolvedWindow, SteeringKnots, SwarmProposal
 from mapctl.protocols import Density, DensityState, Inbetweener
 from mapctl.recording.masks import MissingMask
 from mapctl.skeleton import CANONICAL, LIMBS, TOE_JOINTS, TOES
@@ -659,7 +659,7 @@ def extrapolate_end(query: GapQuery, proposal: Proposal, densities: Sequence[Den
     if density_selection.select_density_for_motion([blurred], known).weight < 1:
         return proposal
     density = select_likeliest_density(densities, known)
-    solver = RecedingHorizonSolver(density, method=replace(ROLLOUT_SOLVER, proposal=keep_warm_start))
+    solver = RecedingHorizonSolver(density, method=replace(ROLLOUT_SOLVER, proposal=None))
     for first in range(start, stop, _LONGEST):
         committed, count = commit_before(body, logits, first, density), min(_LONGEST, stop - first)
         terms = (LatentPrior(_SIGMA_NOISE), _FOOTING)

@@ -33,13 +33,6 @@ WarmStartProposal = Callable[[WindowRequest, Float[Tensor, "1 unknowns"], Meter]
 """(request, warm start over the whole window, meter) to the unknowns from which L-BFGS starts."""
 
 
-def keep_warm_start(
-    request: WindowRequest, warm: Float[Tensor, "1 unknowns"], meter: Meter
-) -> Float[Tensor, "1 unknowns"]:
-    """Return the warm start itself."""
-    return warm
-
-
 @dataclass(frozen=True)
 class SteeringKnots:
     """A space of few dimensions in the noise of a window: some blocks of features at knots in time."""
@@ -131,13 +124,15 @@ class LatentNoiseSolver:
     evaluations in ten, and walks are as near their paths (docs/reference/results.md)."""
     budget: Budget = field(default_factory=lambda: Budget(evaluations=120))
     """Budget of one window."""
-    proposal: WarmStartProposal = keep_warm_start
-    """Proposal of the first round's start."""
+    proposal: WarmStartProposal | None = None
+    """Proposal of the first round's start; None: the warm start itself."""
 
     def __call__(self, request: WindowRequest) -> SolvedWindow:
         """Solve one window."""
         meter, frames = Meter(self.budget.within(request.seconds)), request.context.frames
-        start = self.proposal(request, _extend_warm_start(request), meter)
+        start = _extend_warm_start(request)
+        if self.proposal is not None:
+            start = self.proposal(request, start, meter)
         unknowns, best = self._run_round(request, start, meter)
         start_energy = float(best.start_energy[0])
         for _ in range(self.rounds - 1):
