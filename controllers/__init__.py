@@ -9,10 +9,10 @@ if TYPE_CHECKING:
     from controllers.generation.generate import GenerateSettings as GenerateSettings
     from controllers.generation.generate import generate as generate
     from controllers.inbetweening.blend import blend as blend
-    from controllers.inbetweening.infill import InfillSettings as InfillSettings
     from controllers.inbetweening.infill import chain as chain
     from controllers.inbetweening.infill import infill as infill
     from controllers.inbetweening.infill import retraced as retraced
+    from controllers.inbetweening.pipeline import INFILL_REFINEMENT as INFILL_REFINEMENT
     from controllers.inbetweening.proposers import AutoInbetweener as AutoInbetweener
     from controllers.inbetweening.proposers import RolloutInbetweener as RolloutInbetweener
     from controllers.inbetweening.proposers import SlerpInbetweener as SlerpInbetweener
@@ -31,7 +31,8 @@ _NAMES = {
     "controllers.shots.walk": ("FollowSettings",),
     "controllers.generation.generate": ("GenerateSettings", "generate"),
     "controllers.inbetweening.blend": ("blend",),
-    "controllers.inbetweening.infill": ("InfillSettings", "chain", "infill", "retraced"),
+    "controllers.inbetweening.infill": ("chain", "infill", "retraced"),
+    "controllers.inbetweening.pipeline": ("INFILL_REFINEMENT",),
     "controllers.inbetweening.proposers": ("AutoInbetweener", "RolloutInbetweener", "SlerpInbetweener"),
     "controllers.inbetweening.tween": ("tween",),
     "mapctl.intent.keyframes": ("Drawing", "Key", "Keys"),

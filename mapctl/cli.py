@@ -33,7 +33,6 @@ _EXTRAS = {
     "fbx": {"ufbx"},
     "stream": {"pythonosc"},
     "cluster": {"ray"},
-    "tensorboard": {"tensorboard"},
 }
 """Packages by the extra that installs them."""
 _ANSI_COLOUR = re.compile(r"\x1b\[[\d;]*m")

@@ -19,8 +19,7 @@ from typing_extensions import TypeVar  # with a default before Python 3.13; torc
 
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT
-from mapctl.inbetweening import GapQuery, PositionImage, Proposal, ProposedPositions
-from mapctl.inbetweening.position_image import propose_from_positions
+from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.root_trajectory import LocalMotion, RootTrajectory
 from mapctl.recording import Capture, CaptureProposal
 
@@ -112,47 +111,31 @@ class DataLimits:
         return 1.1 * self.fastest
 
 
-@runtime_checkable
-class PreparedRollout(Protocol):
-    """Rollouts of one density from one state under one plan, for a search that asks for many, one after the other."""
+class PreparedRollout:
+    """Rollouts of one density from one state under one plan, for a search that asks for many, one after the other.
 
-    @abstractmethod
+    Autograd differentiates the density's own `rollout`; a density with a pullback of its own subclasses this.
+    """
+
+    def __init__(self, density: "Density[Any]", state: Any, plan: DiscreteChoices):
+        self._prior, self._state, self._plan = density, state, plan
+        self._graph: tuple[Tensor, tuple[Tensor, Tensor]] | None = None
+
     def roll_out(
         self, noise: Float[Tensor, "batch frames continuous"]
     ) -> tuple[Float[Tensor, "batch frames size"], Float[Tensor, "batch frames"]]:
         """Return features and log densities (nats) as `Density.rollout`, detached."""
-        ...
-
-    @abstractmethod
-    def pull_back(
-        self, d_features: Float[Tensor, "batch frames size"], d_log_density: Float[Tensor, "batch frames"]
-    ) -> Float[Tensor, "batch frames continuous"]:
-        """Return the gradient on the noise of the last `roll_out` from those on its features and log densities."""
-        ...
-
-
-class AutogradRollout(PreparedRollout):
-    """Prepared rollouts of any density: autograd differentiates its `rollout`."""
-
-    def __init__(self, density: "Density[Any]", state: Any, plan: DiscreteChoices):
-        self._density, self._state, self._plan = density, state, plan
-        self._rolled: tuple[Tensor, tuple[Tensor, Tensor]] | None = None
-
-    def roll_out(
-        self, noise: Float[Tensor, "batch frames continuous"]
-    ) -> tuple[Float[Tensor, "batch frames size"], Float[Tensor, "batch frames"]]:
-        """See PreparedRollout."""
         noise = noise.detach().requires_grad_(True)
-        features, log_density = self._density.rollout(self._state, noise, self._plan)
-        self._rolled = noise, (features, log_density)
+        features, log_density = self._prior.rollout(self._state, noise, self._plan)
+        self._graph = noise, (features, log_density)
         return features.detach(), log_density.detach()
 
     def pull_back(
         self, d_features: Float[Tensor, "batch frames size"], d_log_density: Float[Tensor, "batch frames"]
     ) -> Float[Tensor, "batch frames continuous"]:
-        """See PreparedRollout."""
-        assert self._rolled is not None, "there is no rollout yet"
-        noise, rolled = self._rolled
+        """Return the gradient on the noise of the last `roll_out` from those on its features and log densities."""
+        assert self._graph is not None, "there is no rollout yet"
+        noise, rolled = self._graph
         depends = [(out, d) for out, d in zip(rolled, (d_features, d_log_density), strict=True) if out.requires_grad]
         outputs, gradients = zip(*depends, strict=True)
         (gradient,) = torch.autograd.grad(outputs, noise, gradients, materialize_grads=True)
@@ -217,7 +200,7 @@ class Density(Protocol[State]):
 
     def prepare_rollout(self, state: State, plan: DiscreteChoices) -> PreparedRollout:
         """Prepare the rollouts of a search: a density with a pullback of its own offers it here. Default: autograd."""
-        return AutogradRollout(self, state, plan)
+        return PreparedRollout(self, state, plan)
 
     def plan_search(
         self, state: State, noise: Float[Tensor, "batch frames continuous"]
@@ -261,11 +244,6 @@ class Density(Protocol[State]):
         return self.start_after(features[:1])
 
     @property
-    def feature_mean(self) -> Float[Tensor, " size"]:
-        """Mean of the training data, physical units: where searches over features begin. Default: zeros."""
-        return torch.zeros(LAYOUT.size)
-
-    @property
     def feature_std(self) -> Float[Tensor, " size"]:
         """Physical size of the unit in which `log_prob` takes each feature. Default: ones, physical units."""
         return torch.ones(LAYOUT.size)
@@ -297,10 +275,6 @@ class Density(Protocol[State]):
     def conditioned_like_start(self, start: int) -> "Density[State]":
         """Return the density given the labels of the clip that an initial state, of the index `start`, was taken from.
         Default: itself."""
-        return self
-
-    def conditioned_like_clip(self, name: str) -> "Density[State]":
-        """Return the density given the labels in a clip's path. Default: itself."""
         return self
 
     @property
@@ -342,20 +316,6 @@ class Inbetweener(Protocol):
         """Propose a motion of the query's frames without gaps; what is drawn is drawn from the generator, or from a
         new one with seed 0. The proposal names the model of each gap, with the reason where it is another."""
         ...
-
-
-@runtime_checkable
-class PositionInfiller(Inbetweener, Protocol):
-    """An in-betweener that proposes joint positions (Kaufmann et al. 2020), which inverse kinematics makes a motion."""
-
-    @abstractmethod
-    def complete(self, image: PositionImage) -> ProposedPositions:
-        """Propose positions of all joints in all frames; known ones may move."""
-        ...
-
-    def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
-        """Propose a motion of rigid bones near the positions of `complete`."""
-        return propose_from_positions(query, self.complete, "infiller")
 
 
 @runtime_checkable

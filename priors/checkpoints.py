@@ -151,7 +151,10 @@ def save(tensors: dict[str, Tensor], card: Card, path: Path, *, half: bool = Tru
 
     CheckpointError, and nothing written, for a card that holds NaN or infinity, which JSON does not know.
     """
-    text = encode_json(vars(card), path, indent=1)
+    try:
+        text = json.dumps(vars(card), indent=1, allow_nan=False) + "\n"
+    except ValueError as error:
+        raise CheckpointError(f"cannot write {path}: it would hold a number that is not finite ({error})") from error
     kept = {
         name: t.half() if half and t.is_floating_point() and name not in ("mean", "std") else t
         for name, t in tensors.items()
@@ -160,14 +163,6 @@ def save(tensors: dict[str, Tensor], card: Card, path: Path, *, half: bool = Tru
     with atomic_path(path.with_suffix(".json")) as scratch:
         scratch.write_text(text, encoding="utf-8")
         write_tensors(path, kept)
-
-
-def encode_json(values: dict[str, Any], path: Path, *, indent: int | None = None) -> str:
-    """Encode JSON that every parser reads; CheckpointError, naming its file, where a number is not finite."""
-    try:
-        return json.dumps(values, indent=indent, allow_nan=False) + "\n"
-    except ValueError as error:
-        raise CheckpointError(f"cannot write {path}: it would hold a number that is not finite ({error})") from error
 
 
 def load(path: Path) -> tuple[dict[str, Tensor], Card]:

@@ -10,10 +10,10 @@ from torch.nn.functional import leaky_relu, max_pool1d, max_pool2d
 
 from mapctl import rotations
 from mapctl.errors import RequestError
-from mapctl.inbetweening import PositionImage, ProposedPositions
-from mapctl.inbetweening.position_image import mirror_positions
+from mapctl.inbetweening import GapQuery, PositionImage, Proposal, ProposedPositions
+from mapctl.inbetweening.position_image import mirror_positions, propose_from_positions
 from mapctl.numerics.intervals import count_frames_to_observed
-from mapctl.protocols import PositionInfiller
+from mapctl.protocols import Inbetweener
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
 from priors.checkpoints import NetworkConfig
@@ -156,7 +156,7 @@ class InfillerNetwork(nn.Module):
     def forward(self, image: PositionImage) -> ProposedPositions:
         """Fill an image; ours keeps known positions to the bit, an autoencoder makes all anew (section 4.2)."""
         # Joints that are never known are shown at their mean.
-        shown = torch.where(image.ever_known[:, None, :, None], image.positions, self.mean)
+        shown = torch.where(image.known.any(dim=1)[:, None, :, None], image.positions, self.mean)
         rows = self._rows(image, shown)
         if self.keeps_observed:
             # Which joints are known, and how many frames ago and ahead any is, as a share of those that matter.
@@ -186,10 +186,14 @@ class InfillerNetwork(nn.Module):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ConvInfiller(checkpoints.NetworkModel[InfillerNetwork], PositionInfiller):
+class ConvInfiller(checkpoints.NetworkModel[InfillerNetwork], Inbetweener):
     """A trained infiller."""
 
     kind, parts = "infiller", (InfillerNetwork, InfillerConfig)
+
+    def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
+        """Propose a motion of rigid bones near the positions of `complete`."""
+        return propose_from_positions(query, self.complete, self.kind)
 
     @torch.no_grad()
     def complete(self, image: PositionImage) -> ProposedPositions:

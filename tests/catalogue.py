@@ -16,7 +16,6 @@ from toy_density import toy_density
 from controllers.inbetweening.proposers import (
     AutoInbetweener,
     RolloutInbetweener,
-    RolloutSettings,
     SlerpInbetweener,
     StitchedInbetweener,
 )
@@ -167,16 +166,18 @@ REFINERS: dict[str, Refiner] = {"lstm": refiner_of(), "toy": _Rounding()}
 """The LSTM of drawn weights, and one that knows only `mapctl.protocols`."""
 
 
-_QUICK = RolloutSettings(
-    ahead=4,
-    jump=math.inf,  # a small density of drawn weights does nothing else
-    method=LatentNoiseSolver(rounds=1, lbfgs=LbfgsSettings(max_iterations=3), budget=Budget(evaluations=8)),
-)
+_QUICK = LatentNoiseSolver(rounds=1, lbfgs=LbfgsSettings(max_iterations=3), budget=Budget(evaluations=8))
 INBETWEENERS: dict[str, Inbetweener] = {
     "transformer": tiny_transformer(drawn=0.05),
     "infiller": tiny_infiller(drawn=0.02),
     "slerp": SlerpInbetweener(),
-    "rollouts": RolloutInbetweener([tiny_density()], SlerpInbetweener(), _QUICK),
+    "rollouts": RolloutInbetweener(
+        [tiny_density()],
+        SlerpInbetweener(),
+        ahead=4,
+        jump=math.inf,  # a small density of drawn weights does nothing else
+        solver=_QUICK,
+    ),
     "auto": AutoInbetweener(tiny_infiller(drawn=0.02), [tiny_density()]),
     "auto with the transformer": AutoInbetweener(tiny_transformer(drawn=0.05), [tiny_density()]),
     "tweener": tiny_tweener(),

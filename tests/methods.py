@@ -1,17 +1,16 @@
 """How tests fill gaps: `auto` is finished by the MAP stage, `infiller` and `slerp` stay as they are proposed."""
 
-from controllers.inbetweening.pipeline import InfillSettings
+from controllers.common.map_refinement import RefinementSettings
+from controllers.inbetweening.pipeline import INFILL_REFINEMENT
 from controllers.inbetweening.proposers import AutoInbetweener, SlerpInbetweener
 from mapctl.protocols import Inbetweener
 
-UNFINISHED = InfillSettings(refine=False)
 
-
-def by_method(method: str, infiller: Inbetweener) -> tuple[Inbetweener, InfillSettings]:
-    """Return the in-betweener and the settings of a method."""
+def by_method(method: str, infiller: Inbetweener) -> tuple[Inbetweener, RefinementSettings | None]:
+    """Return the in-betweener and the refinement of a method."""
     return {"auto": AutoInbetweener, "infiller": lambda it: it, "slerp": lambda it: SlerpInbetweener()}[method](
         infiller
-    ), InfillSettings(refine=method == "auto")
+    ), INFILL_REFINEMENT if method == "auto" else None
 
 
 def words_of(method: str) -> list[str]:

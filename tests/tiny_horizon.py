@@ -24,9 +24,7 @@ def terms_of(first, frames):
 
 
 def start(seed=0):
-    found = select_initial_state(
-        DENSITY, CURVE, ARCS, terms_of, skeleton=CANONICAL, fps=30.0, generator=generator(seed)
-    )
+    found = select_initial_state(DENSITY, CURVE, ARCS, terms_of, skeleton=CANONICAL, generator=generator(seed))
     return found.committed
 
 

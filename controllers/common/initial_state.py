@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.curves import Curve
-from mapctl.features import LAYOUT, GroundPose, ground_speed, integrate_root
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed, integrate_root
 from mapctl.numerics import gaussian
 from mapctl.pose import decode
 from mapctl.problem.objective import Objective
@@ -45,7 +45,6 @@ def select_initial_state(
     terms_of: Callable[[int, int], Sequence[Term]],
     *,
     skeleton: Skeleton,
-    fps: float,
     generator: torch.Generator,
 ) -> MotionStart:
     """Select, among the prior's initial states near the requested speed, one whose plain rollout fits the terms best.
@@ -55,7 +54,7 @@ def select_initial_state(
     that it settles at from the requested one, and by how unusual its sway is among the candidates. The generator picks
     among the best few, so that seeds give different walks.
     """
-    wanted = float(arcs[1] - arcs[0]) * fps
+    wanted = float(arcs[1] - arcs[0]) * PRIOR_FPS
     ahead = min(_LOOK_AHEAD, len(arcs) - 1)
     near = (prior.initial_states.speed - wanted).abs().argsort()[:_CANDIDATES]
     state = prior.initial_states.state.pick(near)
@@ -66,36 +65,34 @@ def select_initial_state(
         curve.ground_point(0.0).float().expand(len(near), 2), _align_headings(features[:, :ahead], curve, arcs)
     )
     before, planted = torch.zeros(0, skeleton.num_joints, 3), LAYOUT.pick(state.last_frame, "contacts") > 0.5
-    context = WindowContext(prior, state, ground_poses, before, ahead, skeleton, fps, planted, first_frame=1)
+    context = WindowContext(prior, state, ground_poses, before, ahead, skeleton, planted, first_frame=1)
     flat = noise[:, :ahead].flatten(1)
     with torch.no_grad():
         energy = Objective(LatentNoise.from_unknowns(context, flat).build, terms_of(1, ahead)).energy(flat) / ahead
     # The plain rollout soon leaves the curve, where its energy means little: it counts for a tenth.
-    best = (0.1 * energy + _candidate_energy(features, wanted, fps)).argsort()[:_BEST_CANDIDATES]
+    best = (0.1 * energy + _candidate_energy(features, wanted)).argsort()[:_BEST_CANDIDATES]
     pick = int(best[torch.randint(len(best), (1,), generator=generator)])
     ground_pose = GroundPose(ground_poses.position_xz[pick], ground_poses.heading[pick])
     return start_from_state(state.pick(torch.tensor([pick])), ground_pose, skeleton)
 
 
-def _candidate_energy(
-    features: Float[Tensor, "starts frames size"], wanted: float, fps: float
-) -> Float[Tensor, " starts"]:
+def _candidate_energy(features: Float[Tensor, "starts frames size"], wanted: float) -> Float[Tensor, " starts"]:
     """Compute each candidate's energy of speed and sway, nats: deviation from the requested and from the typical."""
     speed = ground_speed(features).mean(-1)
-    sway = _sway(features, fps)
+    sway = _sway(features)
     spread = (sway.quantile(0.75) - sway.quantile(0.25)).clamp_min(1e-4) / 2
     unusual = (sway - sway.quantile(_TYPICAL_SWAY_QUANTILE)) / spread
     return 0.5 * ((speed - wanted) / _SPEED_SIGMA).square() + 0.5 * unusual.square()
 
 
-def _sway(features: Float[Tensor, "starts frames size"], fps: float) -> Float[Tensor, " starts"]:
+def _sway(features: Float[Tensor, "starts frames size"]) -> Float[Tensor, " starts"]:
     """Compute the sway without a curve: rms sideways departure of the root from its smoothed trajectory, metres."""
     ground, _ = integrate_root(features, GroundPose.origin())
-    smooth = gaussian.averaging_matrix(ground.shape[1], _SWAY_SECONDS * fps, ground.dtype) @ ground
+    smooth = gaussian.averaging_matrix(ground.shape[1], _SWAY_SECONDS * PRIOR_FPS, ground.dtype) @ ground
     direction = torch.nn.functional.normalize(torch.gradient(smooth, dim=1)[0], dim=-1)
     departure = ground - smooth
     sideways = departure[..., 0] * direction[..., 1] - departure[..., 1] * direction[..., 0]
-    edge = min(round(2 * _SWAY_SECONDS * fps), ground.shape[1] // 4)
+    edge = min(round(2 * _SWAY_SECONDS * PRIOR_FPS), ground.shape[1] // 4)
     return sideways[:, edge:-edge].square().mean(-1).sqrt()
 
 

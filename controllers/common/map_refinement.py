@@ -26,6 +26,7 @@ from mapctl.problem import density_selection
 from mapctl.problem.density_selection import DensityEnsemble, DensityInterval
 from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver
 from mapctl.problem.solution import Ledger, Outcome, WindowRecord
+from mapctl.problem.unknowns import SMOOTH_FRAMES
 from mapctl.problem.window_solvers import PoseOffsetSolver
 from mapctl.protocols import Density
 from mapctl.recording import Capture
@@ -36,6 +37,8 @@ from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.terms import Clearance, FootContact, Jerk, Keyframe, LatentPrior, Term
 
 _DRIFT_SIGMA_FRAMES = 3.0  # frames, sigma, over which the motion of planted toes is averaged
+_CLEARANCE_RAMP = 8.0  # frames next to ones in which a toe was observed over which the clearance term rises
+_NOISE_SHARE = 0.35  # sigma of the proposal where it was observed, as a share of the capture's noise
 
 
 @dataclass(frozen=True)
@@ -49,27 +52,17 @@ class RefinementSettings:
     """Jerk term, over its number of frames of each window; None leaves it out."""
     clearance: Clearance | None = None
     """Clearance term of swinging toes that were not observed; None leaves it out."""
-    clearance_ramp: float = 8.0
-    """Frames next to ones in which a toe was observed over which the clearance term rises to its full weight."""
-    share: float = 0.35
-    """Sigma of the proposal where it was observed, as a share of the capture's noise."""
     unobserved_sigma_deg: float = 5.0
     """Sigma of the proposed angles of unobserved joints, degrees."""
     unobserved_sigma_cm: float = 5.0
     """Sigma of the proposed position of unobserved hips, centimetres."""
     uncertainty_ramp: float = 0.0
     """Frames next to observed ones over which the sigmas of unobserved ones rise from zero; 0 for at once."""
-    smooth: float = 2.0
-    """Frames (sigma) over which a correction is smoothed."""
     temperature: float = 8.0
     """Temperature of a density's likelihood, if there is one; above 1 it counts less, since the proposal has seen the
     data too."""
-    frames: int = 96
-    """Frames of a window."""
-    ahead: int = 24
-    """Look-ahead: frames of a window that the next one solves again."""
-    past: int = 40
-    """Committed frames that terms may look back on."""
+    window: HorizonSettings = field(default_factory=lambda: HorizonSettings(96, 24, beyond_end=False))
+    """Lengths of windows."""
     lbfgs: LbfgsSettings = field(default_factory=lambda: LbfgsSettings(max_iterations=20))
     """Settings of L-BFGS in one window."""
     budget: Budget = field(default_factory=lambda: Budget(evaluations=20))
@@ -127,9 +120,9 @@ def refine(
     pose = BodyPose.of_motion(proposal)
     start = _extrapolate_backward(pose)
     root, angle = _compute_proposal_sigma(capture, settings, trust)
-    planted, supports = _find_contacts(proposal, contacts, root, angle, settings.smooth)
+    planted, supports = _find_contacts(proposal, contacts, root, angle)
     observed = MissingMask(~capture.seen[0], ~capture.seen_root[0]).known_positions[:, TOE_JOINTS]
-    clearing = _ramp_from_observed(observed, settings.clearance_ramp)
+    clearing = _ramp_from_observed(observed, _CLEARANCE_RAMP)
 
     def terms_of(first: int, frames: int) -> list[Term]:
         part = slice(first, first + frames)
@@ -148,14 +141,14 @@ def refine(
     sigma = torch.cat([root.expand(-1, 3), angle.repeat_interleave(3, dim=-1)], dim=-1)  # in the order of pose.pack
     solver = RecedingHorizonSolver(
         ensemble,
-        HorizonSettings(settings.frames, settings.ahead, settings.past, beyond_end=False),
+        settings.window,
         proposal.skeleton,
         method=PoseOffsetSolver(
-            pose, planted, sigma, settings.smooth, settings.temperature, settings.lbfgs, settings.budget, first_frame
+            pose, planted, sigma, settings.temperature, settings.lbfgs, settings.budget, first_frame
         ),
     )
     # The densities begin in states that make the first window's proposal likely.
-    first = slice(0, min(settings.frames, proposal.num_frames))
+    first = slice(0, min(settings.window.frames, proposal.num_frames))
     states = ensemble.infer_state(pose.slice(0, first.stop).features(start, planted[first]))
     before = torch.zeros(0, proposal.num_joints, 3)
     done = CommittedFrames(states, start, torch.zeros(0, LAYOUT.size), before, discarded=first_frame)
@@ -203,10 +196,9 @@ def _find_contacts(
     logits: Float[Tensor, "frames 2"],
     root: Float[Tensor, "frames 1"],
     angle: Float[Tensor, "frames joints"],
-    smooth: float,
 ) -> tuple[Bool[Tensor, "frames 2"], Float[Tensor, "frames 2"]]:
     """Find contacts, likely by the logits and by the toes' rest both, and supports, metres. Errors of the proposal are
-    normal with these sigmas of root and angles, and smooth over so many frames."""
+    normal with these sigmas of root and angles, and smooth over SMOOTH_FRAMES."""
     positions = proposal.joint_positions()
     toes, noise = positions[:, proposal.skeleton.indices(TOES)], []
     for joint in proposal.skeleton.indices(TOES):
@@ -217,8 +209,8 @@ def _find_contacts(
             above = proposal.skeleton.parents[above]
         noise.append(variance)
     variance = torch.stack(noise, dim=1)
-    # The derivative of errors with the correlation exp(-t^2 / 4 smooth^2).
-    speed_noise = variance.mean(dim=-1).sqrt() * float(proposal.fps) / (math.sqrt(2) * smooth)
+    # The derivative of errors with the correlation exp(-t^2 / 4 SMOOTH_FRAMES^2).
+    speed_noise = variance.mean(dim=-1).sqrt() * float(proposal.fps) / (math.sqrt(2) * SMOOTH_FRAMES)
     resting = compute_rest_log_probability(toes, positions[:, 0], float(proposal.fps), speed_noise)
     planted = debounced(torch.nn.functional.logsigmoid(logits) + resting > math.log(0.5))
     return planted, fit_supports(toes, planted, variance[..., 1].sqrt())
@@ -234,9 +226,9 @@ def _compute_proposal_sigma(
     )
     factor = torch.ones(ramp.shape) if trust is None else trust
     unobserved = math.radians(settings.unobserved_sigma_deg) * ramp * factor
-    angle = torch.where(capture.seen[0], settings.share * capture.sigma[0], unobserved).clamp_min(1e-4)
+    angle = torch.where(capture.seen[0], _NOISE_SHARE * capture.sigma[0], unobserved).clamp_min(1e-4)
     unobserved_root = settings.unobserved_sigma_cm / 100 * ramp_root[:, 0] * factor[:, 0]
-    root = torch.where(capture.seen_root[0], settings.share * capture.sigma_root[0], unobserved_root)
+    root = torch.where(capture.seen_root[0], _NOISE_SHARE * capture.sigma_root[0], unobserved_root)
     # Feet are planted even in a capture without noise, if only by half a millimetre.
     return root.clamp_min(5e-4)[:, None], angle
 

@@ -158,7 +158,7 @@ def _append_segment(whole: DenoiseSolution, piece: DenoiseSolution, start: int) 
         noise_root=(1 - share) * whole.noise_root + share * piece.noise_root,
         faults=_merge_faults(move_frames(whole.faults, 0, stop=skip), move_frames(piece.faults, start, skip, frames)),
         **{name: torch.cat([values[:kept], getattr(piece, name)[skipped:]]) for name, values in whole.by_frame.items()},
-        ledger=whole.ledger.slice(kept).join(piece.ledger.pick(slice(skipped, None))),
+        ledger=whole.ledger.pick(slice(kept)).join(piece.ledger.pick(slice(skipped, None))),
         seconds=whole.seconds + piece.seconds,
         windows=whole.windows + piece.windows,
         status=replace(whole.status, notes=tuple(dict.fromkeys(whole.notes + piece.notes))),

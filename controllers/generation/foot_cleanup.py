@@ -29,16 +29,8 @@ from mapctl.terms.trial import Trial
 
 @dataclass(frozen=True)
 class FootCleanupSettings:
-    """Sigmas and search of the foot clean-up; the terms' own docstrings give the meaning."""
+    """Contact term and windows of the foot clean-up."""
 
-    sigma_noise: float = 1.0
-    """Sigma of the latent prior: above 1 leaves more of the motion's own jitter."""
-    sigma_pose: float = MotionTracking.sigma_pose
-    """Sigma of the distance of joints from the motion's, metres."""
-    sigma_trajectory: float = MotionTracking.sigma_trajectory
-    """Sigma of the trajectory's deviation over the ground within a window, metres."""
-    sigma_heading: float = MotionTracking.sigma_heading
-    """Sigma of the heading's deviation within a window, radians."""
     footing: FootContact = field(
         default_factory=lambda: FootContact(
             sigma_speed=0.06, sigma_height=0.02, sigma_below=0.002, landing=LandingSigmas()
@@ -48,8 +40,6 @@ class FootCleanupSettings:
     never lower than flat: feet that are perfectly still or all at one height would be distinguishable from them."""
     window: HorizonSettings = field(default_factory=HorizonSettings)
     """Lengths of the receding horizon."""
-    share: float = GuidedNoiseSolver.share
-    """Share of the motion's latent noise in the warm start."""
 
     def scaled_to(self, character: Character) -> "FootCleanupSettings":
         """Return the settings for a character of this size, in metres of the prior's size."""
@@ -114,14 +104,8 @@ def _clean_up_window(
     caller_terms: Sequence[Term],
 ) -> CommittedFrames:
     """Commit `count` more frames; a window without a finite solution stays unchanged."""
-    tracking = MotionTracking(
-        window,
-        sigma_pose=settings.sigma_pose,
-        sigma_trajectory=settings.sigma_trajectory,
-        sigma_heading=settings.sigma_heading,
-    )
-    terms: tuple[Term, ...] = LatentPrior(settings.sigma_noise), tracking, settings.footing, *caller_terms
-    method = GuidedNoiseSolver(window, share=settings.share)
+    terms: tuple[Term, ...] = LatentPrior(), MotionTracking(window), settings.footing, *caller_terms
+    method = GuidedNoiseSolver(window)
     solver = RecedingHorizonSolver(prior, settings.window, skeleton, method=method)
     next_done, _ = solver.solve(done, lambda first, frames: terms, len(done.features) + count, generator=generator)
     return next_done

@@ -327,6 +327,6 @@ def _decode_pieces(
             ledger = ledger.join(done.ledger)
         windows, count = tuple(window for done in solved for window in done.windows), len(features)
         solved.clear()
-        ledger_part, seconds = character.ledger(ledger.slice(count)), time.perf_counter() - began
+        ledger_part, seconds = character.ledger(ledger.pick(slice(count))), time.perf_counter() - began
         yield Solution(motion, Status(Outcome.DONE), ledger_part, windows, features, seconds)
         ledger, began = ledger.pick(slice(count, None)), time.perf_counter()

@@ -3,27 +3,26 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Unpack
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from controllers.inbetweening.keyframes import effector_joint
-from controllers.inbetweening.pipeline import InbetweenSolution, InfillSettings, fill
+from controllers.inbetweening.pipeline import FillOptions, InbetweenSolution, fill
 from controllers.inbetweening.tween import MIN_JERK_PEAK_ACCELERATION
 from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.inbetweening.effector_targets import bend_limb
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
-from mapctl.protocols import Density, Inbetweener
+from mapctl.protocols import Inbetweener
 from mapctl.recording.masks import MissingMask, restore_observed
 from mapctl.retarget import from_canonical, to_canonical
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from mapctl.retarget.character import Stance
-from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL, LIMBS, Limb
-from mapctl.terms import Term
 
 _MIN_MARGIN_SECONDS = 0.3
 _USUAL_HAND_ACCELERATION, _MAX_HAND_ACCELERATION = 20.0, 80.0  # m/s^2 of a hand
@@ -46,15 +45,7 @@ class LimbTransfer:
 
 
 def blend(
-    motion: Motion,
-    source: Motion,
-    transfer: LimbTransfer,
-    inbetweener: Inbetweener,
-    *,
-    settings: InfillSettings | None = None,
-    densities: Sequence[Density] = (),
-    terms: Sequence[Term] = (),
-    rig: Rig | None = None,
+    motion: Motion, source: Motion, transfer: LimbTransfer, inbetweener: Inbetweener, **options: Unpack[FillOptions]
 ) -> InbetweenSolution:
     """Move limbs of a motion as the source's, relative to shoulder or hip, scaled, and bent alike; all else stays to
     the bit. In the margins before and after, the limbs are in-betweened.
@@ -68,7 +59,7 @@ def blend(
         raise RequestError(f"frames {transfer.start}:{transfer.stop} are not within the source's 0:{source.num_frames}")
     if transfer.margin is not None and not 0 <= transfer.margin <= 10:
         raise RequestError(f"the margin must lie between 0 and 10 seconds, got {transfer.margin:g}")
-    own, rigmap = to_canonical(motion, rig)
+    own, rigmap = to_canonical(motion, options.get("rig"))
     retargeted = retarget_motion(source, RiggedCharacter(rigmap, Stance.of(own, rigmap)))
     # To the frame after the last, where there is one: at a higher rate some frames lie between the two.
     taken = retargeted.motion.slice(transfer.start, min(transfer.stop + 1, source.num_frames)).resample(motion.fps)
@@ -98,7 +89,7 @@ def blend(
     copied = MissingMask(new[:, None] & moved, nothing)
     transferred = restore_observed(from_canonical(posed, rigmap, motion), motion, copied)
     missing = MissingMask((new_or_margin & ~new)[:, None] & moved, nothing)
-    done = fill(transferred, missing, inbetweener, settings=settings, densities=densities, terms=terms, rig=rig)
+    done = fill(transferred, missing, inbetweener, **options)
     margins = (there.start, there.start - free.start), (there.stop - 1, free.stop - there.stop)
     infeasible = _note_infeasible_margins(transfer, distances, margins, fps)
     status = done.status.with_notes(retargeted.notes).with_notes(infeasible, infeasible=bool(infeasible))

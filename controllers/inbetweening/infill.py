@@ -3,10 +3,11 @@ trajectory alone, predicted from the body (Zhou et al. 2020, section 3.4); or wh
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Unpack
 
 import torch
 
-from controllers.inbetweening.pipeline import InbetweenSolution, InfillSettings, fill
+from controllers.inbetweening.pipeline import FillOptions, InbetweenSolution, fill
 from mapctl.curves.curve import Curve
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
@@ -19,12 +20,10 @@ from mapctl.kinematics.moving import rotate_about_vertical
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
 from mapctl.numerics.smooth_offsets import smooth_between
-from mapctl.protocols import Density, Inbetweener, PathPredictor
+from mapctl.protocols import Inbetweener, PathPredictor
 from mapctl.recording.masks import ALL, Mask, MissingMask, expand_masks, resolve_joint_names
 from mapctl.retarget import identify_rig
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
-from mapctl.retarget.rigs import Rig
-from mapctl.terms import Term
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,36 +68,22 @@ def infill(
     inbetweener: Inbetweener,
     masks: Sequence[Mask],
     *,
-    settings: InfillSettings | None = None,
-    densities: Sequence[Density] = (),
-    terms: Sequence[Term] = (),
-    rig: Rig | None = None,
     curve: Curve | None = None,
-    generator: torch.Generator | None = None,
+    **options: Unpack[FillOptions],
 ) -> InbetweenSolution:
     """Fill the masked joints and frames. RequestError for masks that do not fit.
 
     Values within a gap are ignored. A gap at the motion's beginning or end is extrapolated. Along a `curve` the hips go
-    while they are missing; the in-betweener's rough one then proposes, since others leave it. Of `densities` the
-    likeliest joins the MAP stage, and so do `terms`; all sampling is from the generator.
+    while they are missing; the in-betweener's rough one then proposes, since others leave it.
     """
+    rig = options.get("rig")
     masks = resolve_joint_names(motion, masks, rig)
     # The rig must not be identified from values within a gap.
     shown = interpolate_missing(motion, expand_masks(motion, masks))
     missing = MissingMask.of_masks(motion, masks, identify_rig(shown.skeleton, rig, motion=shown))
     if curve is not None and not missing.root.any():
         raise RequestError("the hips follow a curve where they are missing, and they never are; leave it out")
-    return fill(
-        motion,
-        missing,
-        inbetweener if curve is None else inbetweener.rough,
-        settings=settings,
-        densities=densities,
-        terms=terms,
-        rig=rig,
-        curve=curve,
-        generator=generator,
-    )
+    return fill(motion, missing, inbetweener if curve is None else inbetweener.rough, curve=curve, **options)
 
 
 def retraced(
@@ -107,11 +92,7 @@ def retraced(
     masks: Sequence[Mask],
     *,
     inbetweener: Inbetweener | None = None,
-    settings: InfillSettings | None = None,
-    densities: Sequence[Density] = (),
-    terms: Sequence[Term] = (),
-    rig: Rig | None = None,
-    generator: torch.Generator | None = None,
+    **options: Unpack[FillOptions],
 ) -> InbetweenSolution:
     """Predict the hips' trajectory where masks mark it as lost (`ROOT`); known frames stay to the bit.
 
@@ -119,6 +100,7 @@ def retraced(
     goes by the filled poses. Where no position is known at all the trajectory begins over the origin. RequestError for
     masks that do not fit, for gaps without an in-betweener, and for gaps in a motion without any position.
     """
+    rig = options.get("rig")
     masks = resolve_joint_names(motion, masks, rig)
     lost = expand_masks(motion, masks)
     if bool(lost.joints.any()) and inbetweener is None:
@@ -129,53 +111,31 @@ def retraced(
         raise RequestError("no frame's trajectory is lost; there is nothing to predict")
     shown = interpolate_missing(motion, lost)
     rigmap = identify_rig(shown.skeleton, rig, motion=shown)
-    return fill(
-        motion,
-        MissingMask.of_masks(motion, masks, rigmap, keep_position=False),
-        RetracedInbetweener(path, inbetweener),
-        settings=settings,
-        densities=densities,
-        terms=terms,
-        rig=rig,
-        generator=generator,
-    )
+    missing = MissingMask.of_masks(motion, masks, rigmap, keep_position=False)
+    return fill(motion, missing, RetracedInbetweener(path, inbetweener), **options)
 
 
 _VELOCITY_FRAMES = 5  # frames over which the velocity at a piece's end is estimated
-
-
-@dataclass(frozen=True)
-class ChainSettings:
-    """Lengths of pieces and gaps, frames at the prior's rate."""
-
-    piece: int = 40
-    """Frames of a piece, from the middle of every clip; a shorter clip is taken whole."""
-    gap: tuple[int, int] = (50, 100)
-    """Fewest and most frames of a gap, sampled uniformly."""
-
-    def __post_init__(self):
-        if self.piece < 2 or not 1 <= self.gap[0] <= self.gap[1] <= 900:
-            raise RequestError(f"pieces need 2 frames or more and gaps 1 to 900, got {self.piece} and {self.gap}")
 
 
 def chain(
     clips: Sequence[Motion],
     inbetweener: Inbetweener,
     *,
-    generator: torch.Generator,
-    settings: ChainSettings | None = None,
-    filling: InfillSettings | None = None,
-    densities: Sequence[Density] = (),
-    terms: Sequence[Term] = (),
-    rig: Rig | None = None,
+    piece: int = 40,
+    gap: tuple[int, int] = (50, 100),
+    **options: Unpack[FillOptions],
 ) -> InbetweenSolution:
     """Chain pieces of clips to a motion on the first clip's rig at PRIOR_FPS. RequestError for fewer than two clips.
 
-    Each piece is aligned to the one before: the trajectory goes on at its velocity for half of the gap, then at the
-    next one's. The generator samples the gaps' lengths, then is the in-betweener's. `rig` is that of all clips, where
-    it is not the one that would be recognised.
+    Of every clip `piece` frames are taken, from its middle, or all of a shorter one. Each piece is aligned to the one
+    before: the trajectory goes on at its velocity for half of the gap, then at the next one's. The generator samples
+    each gap's frames, from the fewest to the most of `gap`, then is the in-betweener's. `rig` is that of all clips.
     """
-    settings = settings or ChainSettings()
+    if piece < 2 or not 1 <= gap[0] <= gap[1] <= 900:
+        raise RequestError(f"pieces need 2 frames or more and gaps 1 to 900, got {piece} and {gap}")
+    rig = options.get("rig")
+    options["generator"] = generator = options.get("generator") or torch.Generator().manual_seed(0)
     if len(clips) < 2:
         raise RequestError(f"a chain needs at least two clips, got {len(clips)}")
     body, notes = RiggedCharacter.of(clips[0], rig)[1], []
@@ -185,28 +145,18 @@ def chain(
         retargeted = retarget_motion(clip, body, rig)
         notes += retargeted.notes
         motion = retargeted.motion.resample(PRIOR_FPS)
-        count = min(settings.piece, motion.num_frames)
+        count = min(piece, motion.num_frames)
         start = (motion.num_frames - count) // 2
-        piece = replace(motion.slice(start, start + count), source=None)
+        excerpt = replace(motion.slice(start, start + count), source=None)
         if whole is None:
-            whole = piece
+            whole = excerpt
             continue
-        gap = int(torch.randint(settings.gap[0], settings.gap[1] + 1, (), generator=generator))
-        masks.append(Mask(ALL, whole.num_frames, whole.num_frames + gap))
-        piece = _align_to_predecessor(whole, piece, gap)
-        held = whole.pick(torch.full((gap,), whole.num_frames - 1))
-        whole = whole.join(held).join(piece)
+        frames = int(torch.randint(gap[0], gap[1] + 1, (), generator=generator))
+        masks.append(Mask(ALL, whole.num_frames, whole.num_frames + frames))
+        held = whole.pick(torch.full((frames,), whole.num_frames - 1))
+        whole = whole.join(held).join(_align_to_predecessor(whole, excerpt, frames))
     assert whole is not None, "there are clips"
-    done = infill(
-        body.on_rig(whole),
-        inbetweener,
-        masks,
-        settings=filling,
-        densities=densities,
-        terms=terms,
-        rig=rig,
-        generator=generator,
-    )
+    done = infill(body.on_rig(whole), inbetweener, masks, **options)
     return replace(done, status=done.status.with_notes(notes))
 
 

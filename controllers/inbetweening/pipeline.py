@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -63,14 +63,20 @@ network's, since styles differ in them, except those of toes that skate; a jerk 
 error of a gap."""
 
 
-@dataclass(frozen=True)
-class InfillSettings:
-    """Settings of in-betweening."""
+class FillOptions(TypedDict, total=False):
+    """Options of every job that fills gaps."""
 
-    refine: bool = True
-    """Whether MAP refines the proposal; if not it stays as proposed, on rigid bones and with exact keys."""
-    refinement: RefinementSettings = field(default_factory=lambda: INFILL_REFINEMENT)
-    """Sigmas and search of the MAP stage."""
+    refinement: RefinementSettings | None
+    """How MAP refines the proposal, as by INFILL_REFINEMENT if not given; None leaves it as proposed, on rigid bones
+    and with exact keys."""
+    densities: Sequence[Density]
+    """Densities of which the likeliest joins the MAP stage."""
+    terms: Sequence[Term]
+    """Terms that join the MAP stage."""
+    rig: Rig | None
+    """The motion's rig, where it is not the one that would be recognised."""
+    generator: torch.Generator | None
+    """Source of all random draws; one with seed 0 if not given."""
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -143,27 +149,23 @@ def fill(
     missing: MissingMask,
     inbetweener: Inbetweener,
     *,
-    settings: InfillSettings | None = None,
-    densities: Sequence[Density] = (),
-    terms: Sequence[Term] = (),
-    rig: Rig | None = None,
     targets: EffectorTargets | None = None,
     loose: LooseKeys | None = None,
     curve: Curve | None = None,
-    generator: torch.Generator | None = None,
+    **options: Unpack[FillOptions],
 ) -> InbetweenSolution:
     """Fill missing values of a motion.
 
     `targets` are positions of the rig's hands and feet in frames in which they are missing, `loose` positions over the
-    ground and drawings in such frames; the hips follow `curve` while they are missing. The MAP stage adds `terms`, and
-    the likeliest of `densities` its likelihood; RequestError for terms where it is left out.
+    ground and drawings in such frames; the hips follow `curve` while they are missing. RequestError for terms where the
+    MAP stage is left out.
     """
-    settings, began = settings or InfillSettings(), time.perf_counter()
-    if terms and not settings.refine:
+    refinement, began = options.get("refinement", INFILL_REFINEMENT), time.perf_counter()
+    if options.get("terms") and refinement is None:
         raise RequestError("terms belong to the MAP stage, which is left out")
-    generator = generator or torch.Generator().manual_seed(0)
+    generator = options.get("generator") or torch.Generator().manual_seed(0)
     # The query: the clip at the prior's rate on canonical joints, led along what is requested.
-    clip = CanonicalClip.of(motion, missing, rig)
+    clip = CanonicalClip.of(motion, missing, options.get("rig"))
     if curve is not None:
         clip = replace(clip, canonical=_lead_along_curve(clip.canonical, missing.root, curve))
     if loose is not None:
@@ -185,9 +187,9 @@ def fill(
     unknown = MissingMask(query.missing.joints, unknown_root)
     spread = answer.spread
     trust = None if spread is None else (spread[..., 0] / _USUAL_ERROR).clamp(*_TRUST_RANGE).float()
-    near = widen(unknown.frames, _CONTEXT_FRAMES) & settings.refine  # gaps whose contexts overlap are one window
+    near = widen(unknown.frames, _CONTEXT_FRAMES)  # gaps whose contexts overlap are one window
     for _, first, last in true_intervals(near[:, None]):
-        if last - first < 2:
+        if refinement is None or last - first < 2:
             continue
         part, part_unknown = slice(first, last), unknown.slice(first, last)
         proposal = canonical.slice(first, last)
@@ -201,17 +203,17 @@ def fill(
                 sigma=torch.zeros(CANONICAL.num_joints),
                 sigma_root=0.0,
             ),
-            settings.refinement,
-            densities=densities,
+            refinement,
+            densities=options.get("densities", ()),
             targets=None if reached is None else EffectorTargets(reached.positions[part], reached.wanted[part]),
-            terms=terms,
+            terms=options.get("terms", ()),
             first_frame=first,
             trust=None if trust is None else trust[part],
         )
         quats[part] = torch.where(part_unknown.joints[..., None], refined.motion.local_quat_xyzw, quats[part])
         root[part] = torch.where(part_unknown.root[:, None], refined.motion.root_position, root[part])
         ledger, windows = ledger.join(refined.ledger), (*windows, *refined.windows)
-    if settings.refine:
+    if refinement is not None:
         canonical = replace(canonical, root_position=root, local_quat_xyzw=quats)
     # The result on the rig: seams, then targets and positions to the millimetre.
     done, unreached = _reach_targets(clip, clip.back(canonical, asked), targets)

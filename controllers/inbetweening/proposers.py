@@ -15,7 +15,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import scipy
 import torch
@@ -43,7 +43,7 @@ from mapctl.numerics.smooth_offsets import interpolate_offsets, interpolate_turn
 from mapctl.pose import decode
 from mapctl.problem import density_selection
 from mapctl.problem.receding_horizon import CommittedFrames, RecedingHorizonSolver, replay
-from mapctl.problem.window_solvers import LatentNoiseSolver, SolvedWindow, SteeringKnots, SwarmProposal, keep_warm_start
+from mapctl.problem.window_solvers import LatentNoiseSolver, SolvedWindow, SteeringKnots, SwarmProposal
 from mapctl.protocols import Density, DensityState, Inbetweener
 from mapctl.recording.masks import MissingMask
 from mapctl.skeleton import CANONICAL, LIMBS, TOE_JOINTS, TOES
@@ -338,7 +338,9 @@ def lay_curve(query: GapQuery, fastest: float, ahead: int) -> tuple[Curve, Float
     last, metres at the canonical size; also return the arcs of the frames and of so many `ahead` of them, metres. None
     where there are others, and where the body would stand, or be faster than `fastest`, m/s."""
     loose = query.loose
-    if loose is None or not query.only_positions:
+    if loose is None or bool(loose.drawn.any()) or query.effector_targets is not None:
+        return None
+    if not bool(query.nothing_known.all()):
         return None
     frames = loose.placed.nonzero()[:, 0]
     if len(frames) < 2 or int(frames[0]) > 0 or int(frames[-1]) < query.motion.num_frames - 1:
@@ -527,27 +529,13 @@ ROLLOUT_SPAN = f"{(_SHORTEST + 1) / PRIOR_FPS:.2g} to {(_LONGEST + 1) / PRIOR_FP
 """Range of gaps that are rolled through, in words: seconds from key to key."""
 
 
-@dataclass(frozen=True)
-class RolloutSettings:
-    """Settings of rollouts through gaps."""
-
-    ahead: int = 15
-    """Frames after a gap that are rolled with it, of which the known ones are targets too."""
-    jump: float = 1.5
-    """A rollout jumps where a hand or a foot steps, relative to the hips, so many times as far as anywhere in the
-    fallback's motion: an arrival that noise does not lead to is bought with a leg thrown over in one frame."""
-    least_jump: float = 0.12
-    """Metres in a frame that no jump stays under, however still the fallback's motion is; hands and feet of a walk step
-    as far."""
-    method: LatentNoiseSolver = field(
-        default_factory=lambda: LatentNoiseSolver(
-            rounds=2,
-            lbfgs=LbfgsSettings(max_iterations=24),
-            budget=Budget(evaluations=96),
-            proposal=SwarmProposal(SwarmSettings(particles=8, iterations=5), SteeringKnots(knots=4, spread=0.7)),
-        )
-    )
-    """Solver: the swarm and the search after it."""
+ROLLOUT_SOLVER = LatentNoiseSolver(
+    rounds=2,
+    lbfgs=LbfgsSettings(max_iterations=24),
+    budget=Budget(evaluations=96),
+    proposal=SwarmProposal(SwarmSettings(particles=8, iterations=5), SteeringKnots(knots=4, spread=0.7)),
+)
+"""Search of rollouts: a swarm, and L-BFGS after it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -559,8 +547,16 @@ class RolloutInbetweener(Inbetweener):
     """Densities to choose from, at least one."""
     fallback: Inbetweener
     """Proposes what is not rolled through, and what comes before and after."""
-    settings: RolloutSettings = field(default_factory=RolloutSettings)
-    """Settings of the rollouts."""
+    ahead: int = 15
+    """Frames after a gap that are rolled with it, of which the known ones are targets too."""
+    jump: float = 1.5
+    """A rollout jumps where a hand or a foot steps, relative to the hips, so many times as far as anywhere in the
+    fallback's motion: an arrival that noise does not lead to is bought with a leg thrown over in one frame."""
+    least_jump: float = 0.12
+    """Metres in a frame that no jump stays under, however still the fallback's motion is; hands and feet of a walk step
+    as far."""
+    solver: LatentNoiseSolver = ROLLOUT_SOLVER
+    """Search of one rollout."""
 
     @property
     def rough(self) -> Inbetweener:
@@ -577,10 +573,10 @@ class RolloutInbetweener(Inbetweener):
         base = self.fallback.propose(query, generator=generator)
         if not query.enclosed_gaps:
             return base
-        generator, settings = generator or torch.Generator().manual_seed(0), self.settings
+        generator = generator or torch.Generator().manual_seed(0)
         body, logits, others = query.to_unit_size(base.motion), base.contact_logits.clone(), list(base.others)
         density = select_likeliest_density(self.densities, body)
-        largest = max(settings.least_jump, settings.jump * _measure_largest_step(body))
+        largest = max(self.least_jump, self.jump * _measure_largest_step(body))
         state, since = None, 0
         for start, stop in query.enclosed_gaps:
             if not _SHORTEST <= stop - start <= _LONGEST:
@@ -611,8 +607,8 @@ class RolloutInbetweener(Inbetweener):
     ) -> tuple[Motion, Float[Tensor, "frames 2"]]:
         """Roll through a gap to all joints in the known frames after it, and to effector targets within it; planted
         toes, which the correction at arrival moves, are then held. Also return the contact logits."""
-        (start, stop), settings = gap, self.settings
-        part = slice(start, stop + settings.ahead)
+        start, stop = gap
+        part = slice(start, stop + self.ahead)
         known = ~query.nothing_known[part]
         frames = int(known.nonzero()[-1]) + 1
         positions = body.joint_positions()[part][:frames]
@@ -624,7 +620,7 @@ class RolloutInbetweener(Inbetweener):
         arrival = Keyframe(positions.float(), wanted, _SIGMA_ARRIVAL)
         white = torch.randn(frames, LAYOUT.continuous, generator=generator)
         noise = _TEMPERATURE * gaussian.unit_variance_matrix(frames, _SLOW, white.dtype) @ white
-        window = RecedingHorizonSolver(density, method=settings.method).solve_window(
+        window = RecedingHorizonSolver(density, method=self.solver).solve_window(
             replace(committed, warm_start=noise),
             (LatentPrior(_SIGMA_NOISE), _FOOTING, arrival),
             frames,
@@ -663,7 +659,7 @@ def extrapolate_end(query: GapQuery, proposal: Proposal, densities: Sequence[Den
     if density_selection.select_density_for_motion([blurred], known).weight < 1:
         return proposal
     density = select_likeliest_density(densities, known)
-    solver = RecedingHorizonSolver(density, method=replace(RolloutSettings().method, proposal=keep_warm_start))
+    solver = RecedingHorizonSolver(density, method=replace(ROLLOUT_SOLVER, proposal=None))
     for first in range(start, stop, _LONGEST):
         committed, count = commit_before(body, logits, first, density), min(_LONGEST, stop - first)
         terms = (LatentPrior(_SIGMA_NOISE), _FOOTING)

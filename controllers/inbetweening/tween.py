@@ -4,7 +4,7 @@ of a hand or a foot, the limb is bent to reach it."""
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, Unpack
 
 import torch
 from jaxtyping import Bool
@@ -16,17 +16,16 @@ from controllers.inbetweening.keyframes import (
     measure_drawing_error,
     missing_between_keys,
 )
-from controllers.inbetweening.pipeline import InbetweenSolution, InfillSettings, fill
+from controllers.inbetweening.pipeline import FillOptions, InbetweenSolution, fill
 from mapctl import joint_ranges, rotations
 from mapctl.inbetweening.effector_targets import EffectorTargets, LooseKeys
 from mapctl.inbetweening.missing import interpolate_missing
 from mapctl.intent.keyframes import Key, Keys
 from mapctl.motion import Motion
-from mapctl.protocols import Density, Inbetweener
+from mapctl.protocols import Inbetweener
 from mapctl.recording.masks import MissingMask
 from mapctl.retarget import RigMap, as_rig, identify_rig, rig_joint_positions, to_canonical
 from mapctl.retarget.rigs import Rig
-from mapctl.terms import Term
 
 _MAX_ROOT_SPEED = 10.0  # m/s of the hips
 _MAX_JOINT_RATE = 30.0  # rad/s of a joint
@@ -114,40 +113,19 @@ def note_joint_ranges(canonical: Motion, missing: MissingMask, rigmap: RigMap) -
     return (*notes[:_MAX_NOTES], *more)
 
 
-def tween(
-    motion: Motion,
-    keys: Keys,
-    inbetweener: Inbetweener,
-    *,
-    settings: InfillSettings | None = None,
-    densities: Sequence[Density] = (),
-    terms: Sequence[Term] = (),
-    rig: Rig | None = None,
-    generator: torch.Generator | None = None,
-) -> InbetweenSolution:
+def tween(motion: Motion, keys: Keys, inbetweener: Inbetweener, **options: Unpack[FillOptions]) -> InbetweenSolution:
     """Make a motion of the same length through the keys of a motion, of which all else is ignored.
 
-    Of `densities` the likeliest joins the MAP stage, and so do `terms`; all sampling is from the generator.
     RequestError for keys that do not fit the motion or its rig; keys that no body could meet in time are named in the
     status, which is then infeasible.
     """
     wanted = keys.checked(motion)
-    canonical, rigmap, shown = keyframe_motion(wanted, motion, rig)
+    canonical, rigmap, shown = keyframe_motion(wanted, motion, options.get("rig"))
     missing, targets = missing_between_keys(wanted, motion, rigmap), collect_effector_targets(wanted, shown, rigmap)
     loose = collect_loose_keys(wanted, motion, rigmap)
     infeasible = check_keyframes(shown, canonical, rigmap, missing, targets, loose)
-    done = fill(
-        motion,
-        missing,
-        inbetweener,
-        settings=settings,
-        densities=densities,
-        terms=terms,
-        rig=as_rig(rigmap),
-        targets=targets,
-        loose=loose,
-        generator=generator,
-    )
+    options["rig"] = as_rig(rigmap)
+    done = fill(motion, missing, inbetweener, targets=targets, loose=loose, **options)
     beyond = note_joint_ranges(canonical, missing, rigmap)
     status = done.status.with_notes(beyond)
     return replace(done, status=status.with_notes(infeasible, infeasible=bool(infeasible)))

@@ -13,7 +13,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from controllers.common.map_refinement import estimate_rest_height
-from controllers.inbetweening.pipeline import InfillSettings, fill
+from controllers.inbetweening.pipeline import fill
 from controllers.shots.footsteps import Displacement, Footstep, LastSteps, plan_footsteps, take_given, take_steps
 from controllers.shots.request import Arrival, Lead
 from controllers.shots.trajectory import Span, Trajectory
@@ -64,7 +64,7 @@ class Filling:
         part, missing = self.motion.slice(first, last), self.missing.slice(first, last)
         planted = contacts.detect_contacts(part.joint_positions()[:, _TOES], part.fps)
         if bool(missing.frames.any()):
-            done = fill(part, missing, inbetweener, settings=InfillSettings(refine=False))
+            done = fill(part, missing, inbetweener, refinement=None)
             part, planted = done.motion, done.contacts
         shown = part.slice(max(0, gap[0] - 2), min(part.num_frames, gap[1] + 2))
         peaks = body.measure_peaks(shown.joint_positions()[:, _EFFECTORS], shown.root_position, float(shown.fps))

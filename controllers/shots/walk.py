@@ -98,13 +98,7 @@ def walk_arcs(
 
     if start is None:
         start = select_initial_state(
-            prior,
-            unit_curve,
-            unit_arcs,
-            all_terms,
-            skeleton=character.unit_skeleton,
-            fps=PRIOR_FPS,
-            generator=generator,
+            prior, unit_curve, unit_arcs, all_terms, skeleton=character.unit_skeleton, generator=generator
         )
     committed = replace(start.committed, discarded=first_frame)  # so that terms see the time in the shot
     solver = RecedingHorizonSolver(prior, settings.window, character.unit_skeleton, method=settings.method)

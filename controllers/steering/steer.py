@@ -41,18 +41,19 @@ from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, Re
 from mapctl.problem.solution import Ledger, Outcome, Solution, Status
 from mapctl.problem.unknowns import WindowRequest
 from mapctl.problem.window_solvers import (
-    BestOfSamples,
     GuidedNoiseSolver,
     LatentNoiseSolver,
     SingleWindowSolver,
     SolvedWindow,
     SteeringKnots,
+    SwarmProposal,
 )
 from mapctl.protocols import Density
 from mapctl.runtime.stepwise import StepwiseWork
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings, LbfgsStatus
+from mapctl.solver.swarm import SwarmSettings
 from mapctl.terms import FootContact, KeepClear, LatentPrior, RootVelocity, StepLength, Term
 
 _BODY = 0.4  # metres from an obstacle's edge to the hips that pass it
@@ -495,7 +496,7 @@ def _find_steps(state: SteerState, command: Command) -> PlannedSteps | None:
     if command.speed > 0:
         start = _start_target(state, command)
         targets = start.ahead(command, state.settings.limits, frames=PLANNED_FRAMES, fps=PRIOR_FPS)
-    return plan_steps(_find_pose(state), _find_mean_stand(state), command, targets)
+    return plan_steps(_find_pose(state), _find_mean_stand(state, command), command, targets)
 
 
 def _start_target(state: SteerState, command: Command) -> SteeringTarget:
@@ -507,7 +508,7 @@ def _find_stand(state: SteerState, command: Command) -> Stand | None:
     """Find the stand of a body at rest that is to stand as it does."""
     if command.speed > 0 or command.turning is not None or not _is_at_rest(state):
         return None
-    return state.stand or Stand(_find_pose(state), _find_mean_stand(state))
+    return state.stand or Stand(_find_pose(state), _find_mean_stand(state, command))
 
 
 def _is_at_rest(state: SteerState) -> bool:
@@ -521,10 +522,12 @@ def _find_pose(state: SteerState) -> Motion:
     return find_pose(committed.features[-1], committed.ground_pose, skeleton)
 
 
-def _find_mean_stand(state: SteerState) -> Motion:
-    """Return the stand where the body is."""
+def _find_mean_stand(state: SteerState, command: Command) -> Motion:
+    """Return the stand where the body is, in the mean pose of the slower half of the prior's initial states."""
+    starts = condition_prior(state.prior, command.labels).initial_states
+    mean = starts.state.last_frame[starts.speed <= starts.speed.median()].mean(dim=0)
     skeleton, toe_height = state.character.unit_skeleton, state.settings.footing.rest_height
-    return find_stand(state.prior.feature_mean, state.committed.ground_pose, skeleton, toe_height)
+    return find_stand(mean, state.committed.ground_pose, skeleton, toe_height)
 
 
 def _stand_still(state: SteerState, command: Command, began: float) -> tuple[SteerState, SteerFrames]:
@@ -617,14 +620,15 @@ def _relax_footing_first(
     predicts new contacts."""
     space = SteeringKnots(_KNOTS, tuple(LAYOUT.slices)[:-1], _KNOT_SIGMA)
     budget = replace(half.budget, evaluations=samples + (half.budget.evaluations or 1))
-    relaxed = replace(half, proposal=BestOfSamples(samples, space), budget=budget)
+    relaxed = replace(half, proposal=SwarmProposal(SwarmSettings(samples, iterations=1), space), budget=budget)
     others = [term for term in terms if term.name != footing.name]
 
     def solve(request: WindowRequest) -> SolvedWindow:
         request = replace(request, seconds=request.seconds / 2)
         first = relaxed(replace(request, terms=others))
         second = half(replace(request, warm_start=first.warm_start))
-        return replace(second, evaluations=first.evaluations + second.evaluations)
+        spent = first.record.evaluations + second.record.evaluations
+        return replace(second, record=replace(second.record, evaluations=spent))
 
     return solve
 

@@ -82,7 +82,7 @@ def find_pose(features: Float[Tensor, "size"], ground: GroundPose, skeleton: Ske
 
 
 def find_stand(mean: Float[Tensor, "size"], ground: GroundPose, skeleton: Skeleton, toe_height: float) -> Motion:
-    """Return a stand at a ground pose: the mean pose of a density's data with both feet flat, side by side."""
+    """Return a stand at a ground pose: a mean pose, as features, with both feet flat, side by side."""
     pose = find_pose(mean, ground, skeleton)
     heading = ground.heading.reshape(1).double()
     toes = rotations.rotate_about_y(pose.joint_positions()[:, CANONICAL.indices(TOES)] - pose.root_position, -heading)

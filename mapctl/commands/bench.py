@@ -92,9 +92,7 @@ def _time_evaluation(prior: Density, count: int, repeats: int) -> float:
     arcs = torch.arange(2 * frames, dtype=torch.float64) * _SPEED / PRIOR_FPS
     terms_of = build_follow_terms(curve, arcs, settings, torch.zeros(len(arcs), LAYOUT.continuous))
     generator = torch.Generator().manual_seed(0)
-    start = select_initial_state(
-        prior, curve, arcs, terms_of, skeleton=CANONICAL, fps=PRIOR_FPS, generator=generator
-    ).committed
+    start = select_initial_state(prior, curve, arcs, terms_of, skeleton=CANONICAL, generator=generator).committed
     context = WindowContext(prior, start.state, start.ground_pose, start.joints_world, frames)
     unknowns = 0.1 * torch.randn(count, frames * LAYOUT.continuous, generator=generator)
     objective = Objective(LatentNoise.from_unknowns(context, unknowns).build, terms_of(1, frames))

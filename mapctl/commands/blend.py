@@ -8,7 +8,7 @@ from tyro.conf import arg
 
 import priors
 from controllers.inbetweening.blend import LimbTransfer, blend
-from controllers.inbetweening.pipeline import InfillSettings
+from controllers.inbetweening.pipeline import INFILL_REFINEMENT
 from mapctl.commands.shared import inputs, options, results
 from mapctl.commands.shared.command import ModelCommand, conclude
 from mapctl.commands.shared.options import parse_frame, parse_range
@@ -53,8 +53,8 @@ def run(command: Blend) -> int:
     start, stop = parse_range(command.frames, fps=float(other.fps), frames=other.num_frames, what="range of --frames")
     names = tuple(name.strip() for name in command.joints.split(","))
     transfer = LimbTransfer(names, start, stop, parse_frame(command.at, fps=float(motion.fps)), margin=command.margin)
-    settings = InfillSettings(refine=not command.no_refine)
-    done = blend(motion, other, transfer, priors.load_inbetweener(command.inbetweener), settings=settings, rig=rig)
+    refinement = None if command.no_refine else INFILL_REFINEMENT
+    done = blend(motion, other, transfer, priors.load_inbetweener(command.inbetweener), refinement=refinement, rig=rig)
     results.write_result("blend", command, done, motion, rig=rig)
     if not command.quiet:
         print("\n".join((f"{command.out}: {done.motion.num_frames} frames", *done.notes)))

@@ -8,8 +8,8 @@ import torch
 import tyro
 from tyro.conf import arg
 
-from controllers.inbetweening.infill import ChainSettings, chain
-from controllers.inbetweening.pipeline import InfillSettings
+from controllers.inbetweening.infill import chain
+from controllers.inbetweening.pipeline import INFILL_REFINEMENT
 from controllers.inbetweening.proposers import build_inbetweener
 from mapctl.commands.shared import inputs, options, outputs, results
 from mapctl.commands.shared.command import ModelCommand
@@ -44,13 +44,13 @@ def run(command: Chain) -> int:
     options.check_seed(command.seed)
     results.check_proposal(command)
     results.check_destinations(command.out, command.video, given=command.clips)
-    settings = ChainSettings(piece=command.piece, gap=_parse_gap(command))
     rig = inputs.read_rig(command.rig, command)
     done = chain(
         [inputs.read_motion(path, rig, quiet=command.quiet) for path in command.clips],
         build_inbetweener(command.method, results.load_models(command)),
-        settings=settings,
-        filling=InfillSettings(refine=not command.no_refine),
+        piece=command.piece,
+        gap=_parse_gap(command),
+        refinement=None if command.no_refine else INFILL_REFINEMENT,
         rig=rig,
         generator=torch.Generator().manual_seed(command.seed),
     )

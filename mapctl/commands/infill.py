@@ -8,7 +8,8 @@ import torch
 from tyro.conf import UseAppendAction, arg
 
 import priors
-from controllers.inbetweening.infill import InbetweenSolution, InfillSettings, infill, retraced
+from controllers.inbetweening.infill import infill, retraced
+from controllers.inbetweening.pipeline import INFILL_REFINEMENT, FillOptions, InbetweenSolution
 from controllers.inbetweening.proposers import build_inbetweener
 from mapctl import curves
 from mapctl.commands.shared import inputs, options, results
@@ -98,30 +99,18 @@ def run(command: Infill) -> int:
 def _run_infilling(
     command: Infill, motion: Motion, masks: Sequence[Mask], ways: Sequence[Mask], rig: Rig | None
 ) -> InbetweenSolution:
-    settings, densities = InfillSettings(refine=not command.no_refine), priors.load_choice(command.prior)
-    generator = torch.Generator().manual_seed(command.seed)
+    shared = FillOptions(
+        refinement=None if command.no_refine else INFILL_REFINEMENT,
+        densities=priors.load_choice(command.prior),
+        rig=rig,
+        generator=torch.Generator().manual_seed(command.seed),
+    )
     inbetweener = None
     # Where no pose is missing the network that would propose them need not be there.
     if not ways or any(mask.joint != ROOT for mask in masks):
         inbetweener = build_inbetweener(command.method, results.load_models(command, prior=command.prior))
     if ways or inbetweener is None:
-        return retraced(
-            motion,
-            priors.load_path(command.path or "path"),
-            (*masks, *ways),
-            inbetweener=inbetweener,
-            settings=settings,
-            densities=densities,
-            rig=rig,
-            generator=generator,
-        )
-    return infill(
-        motion,
-        inbetweener,
-        masks,
-        settings=settings,
-        densities=densities,
-        rig=rig,
-        curve=None if command.curve is None else curves.read(command.curve),
-        generator=generator,
-    )
+        path = priors.load_path(command.path or "path")
+        return retraced(motion, path, (*masks, *ways), inbetweener=inbetweener, **shared)
+    curve = None if command.curve is None else curves.read(command.curve)
+    return infill(motion, inbetweener, masks, curve=curve, **shared)

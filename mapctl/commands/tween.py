@@ -9,7 +9,7 @@ from tyro.conf import arg
 
 import priors
 from controllers.inbetweening.keyframes import KeyframeClip, build_keyframe_clip, suggest_intervals
-from controllers.inbetweening.pipeline import InbetweenSolution, InfillSettings
+from controllers.inbetweening.pipeline import INFILL_REFINEMENT, InbetweenSolution
 from controllers.inbetweening.proposers import (
     AutoInbetweener,
     ModelLoaders,
@@ -93,11 +93,11 @@ def _run_request(command: Tween, request: KeyRequest | None) -> int:
     _check(command, request)
     clip, dna = _read_keyframe_clip(command, request), results.read_dna(command)
     models = results.load_models(command, prior=command.prior, dna=dna)
-    settings, densities = InfillSettings(refine=not command.no_refine), priors.load_choice(command.prior)
+    refinement, densities = None if command.no_refine else INFILL_REFINEMENT, priors.load_choice(command.prior)
 
     def make(by: Inbetweener, generator: torch.Generator) -> InbetweenSolution:
         return tween(
-            clip.motion, clip.keys, by, settings=settings, densities=densities, rig=clip.rig, generator=generator
+            clip.motion, clip.keys, by, refinement=refinement, densities=densities, rig=clip.rig, generator=generator
         )
 
     if command.variations > 1:

@@ -120,11 +120,6 @@ class PositionImage:
         copied, away = (each.unflatten(0, (batch, -1)).transpose(1, 2).unflatten(2, shape) for each in (copied, away))
         return copied, away
 
-    @property
-    def ever_known(self) -> Bool[Tensor, "batch joints"]:
-        """Whether a joint is known in any frame."""
-        return self.known.any(dim=1)
-
 
 @dataclass(frozen=True, eq=False)
 class ProposedPositions:

@@ -57,12 +57,6 @@ class GapQuery:
         return [(start, stop) for _, start, stop in gaps if start > 0 and stop < self.motion.num_frames]
 
     @property
-    def only_positions(self) -> bool:
-        """Whether nothing is given but where the hips are over the ground."""
-        open_poses = bool(self.nothing_known.all()) and self.effector_targets is None
-        return open_poses and self.loose is not None and not bool(self.loose.drawn.any())
-
-    @property
     def root_only_keys(self) -> Bool[Tensor, " frames"]:
         """Single frames, or a few, of which nothing is known but the hips' position and rotation."""
         turns, root = self.missing.joints, self.missing.root

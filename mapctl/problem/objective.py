@@ -33,11 +33,6 @@ class Parametrisation(Protocol):
         """Build the trial of each candidate; differentiable."""
         ...
 
-    @abstractmethod
-    def warm_start(self, unknowns: Float[Tensor, "1 unknowns"]) -> Float[Tensor, "frames width"]:
-        """Return by frame what the solver of a window that overlaps this one may start from."""
-        ...
-
     def build_detached(self, unknowns: Float[Tensor, "batch unknowns"]) -> Trial | None:
         """Build the trials of `build` without a graph, with their world poses, for `pull_back`. Default: None, autograd
         serves."""

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, integrate_root
+from mapctl.features import LAYOUT, GroundPose, integrate_root
 from mapctl.problem.density_selection import DensityEnsemble
 from mapctl.problem.solution import Ledger, Outcome, WindowRecord
 from mapctl.problem.unknowns import WindowContext, WindowRequest
@@ -71,7 +71,7 @@ class CommittedFrames:
     joints_world: Float[Tensor, "past joints 3"]
     """World joint positions of the last frames, metres, oldest first."""
     warm_start: Float[Tensor, "ahead width"] = field(default_factory=lambda: torch.zeros(0, LAYOUT.continuous))
-    """Warm start of the next window: what the last one found for its look-ahead (see `Parametrisation`)."""
+    """Warm start of the next window: what the last one found for its look-ahead (see `SolvedWindow`)."""
     ledger: Ledger = field(default_factory=Ledger)
     """Energy and residual of the solved frames."""
     windows: tuple[WindowRecord, ...] = ()
@@ -121,8 +121,6 @@ class RecedingHorizonSolver:
     """Lengths of windows."""
     skeleton: Skeleton = CANONICAL
     """Bones of the character."""
-    fps: float = PRIOR_FPS
-    """Frames per second."""
     method: SingleWindowSolver = field(default_factory=LatentNoiseSolver)
     """Solver of one window."""
 
@@ -180,7 +178,6 @@ class RecedingHorizonSolver:
             committed.joints_world,
             frames,
             self.skeleton,
-            self.fps,
             contacts_before=committed.contacts,
             heels_before=committed.locate_heels(self.skeleton),
             first_frame=committed.discarded + len(committed.features),
@@ -191,17 +188,14 @@ class RecedingHorizonSolver:
         """Commit the first frames of a window that took so many seconds."""
         features = window.trial.features[0, :count]
         ground, heading = integrate_root(features, done.ground_pose)
-        record = WindowRecord(
-            count, seconds, window.evaluations, window.start_energy, window.energy, window.stop_reason, window.choice
-        )
         return CommittedFrames(
             state=self.density.advance(done.state, features.unsqueeze(0)),
             ground_pose=GroundPose(ground[-1], heading[-1]),
             features=torch.cat([done.features, features]),
             joints_world=torch.cat([done.joints_world, window.trial.joints_world[0, :count]])[-self.settings.past :],
             warm_start=window.warm_start[count:],
-            ledger=done.ledger.join(window.ledger.slice(count)),
-            windows=(*done.windows, record),
+            ledger=done.ledger.join(window.ledger.pick(slice(count))),
+            windows=(*done.windows, replace(window.record, frames=count, seconds=seconds)),
             forecast=window.trial.joints_world[0, count:],
             ahead=window.trial.features[0, count:],
             discarded=done.discarded,

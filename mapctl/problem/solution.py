@@ -1,7 +1,6 @@
 """Solution of a MAP problem: the motion, a status whose text is the message, and the ledger of energies and
 residuals."""
 
-import builtins
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -50,11 +49,7 @@ class Ledger:
         mine, theirs = ({entry.name: entry for entry in ledger.entries} for ledger in (self, other))
         return Ledger(tuple(_join_entries(mine.get(name), theirs.get(name), self, other) for name in mine | theirs))
 
-    def slice(self, frames: int) -> "Ledger":
-        """Return the ledger of the first frames."""
-        return self.pick(builtins.slice(frames))
-
-    def pick(self, frames: builtins.slice) -> "Ledger":
+    def pick(self, frames: slice) -> "Ledger":
         """Return the ledger of some frames."""
         return Ledger(tuple(replace(e, energy=e.energy[frames], residual=e.residual[frames]) for e in self.entries))
 

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl.errors import MapctlError
-from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose
+from mapctl.features import LAYOUT, GroundPose
 from mapctl.kinematics import fast
 from mapctl.numerics import gaussian
 from mapctl.pose import BodyPose
@@ -45,8 +45,6 @@ class WindowContext:
     """Number of frames in the window."""
     skeleton: Skeleton = CANONICAL
     """Bones of the character."""
-    fps: float = PRIOR_FPS
-    """Frames per second."""
     contacts_before: Bool[Tensor, "*batch 2"] = field(default_factory=lambda: torch.zeros(2, dtype=torch.bool))
     """Left and right toe planted in the last committed frame; unbatched or one row a candidate."""
     heels_before: Float[Tensor, "known 2 3"] = field(default_factory=lambda: torch.zeros(0, 2, 3))
@@ -67,10 +65,6 @@ class WindowContext:
         assert not isinstance(self.state, tuple)
         return self.state
 
-    def expand_state(self, batch: int) -> DensityState:
-        """Expand the one density's state to a batch of candidates."""
-        return self.prior_state.expand(batch)
-
     def build_trial(
         self,
         features: Float[Tensor, "batch frames size"],
@@ -89,7 +83,6 @@ class WindowContext:
             contacts_before=self.contacts_before,
             heels_before=self.heels_before,
             skeleton=self.skeleton,
-            fps=self.fps,
             first_frame=self.first_frame,
         )
 
@@ -103,7 +96,7 @@ class WindowRequest:
     terms: Sequence[Term]
     """Terms whose energies are summed over the window's frames."""
     warm_start: Float[Tensor, "ahead width"]
-    """Result of the last window for the first of these frames (see `Parametrisation.warm_start`); none at the start.
+    """Result of the last window for the first of these frames (see `SolvedWindow`); none at the start.
     """
     generator: torch.Generator
     """Source of all random draws."""
@@ -130,13 +123,13 @@ class LatentNoise(Parametrisation):
     def from_unknowns(context: WindowContext, unknowns: Float[Tensor, "batch unknowns"]) -> "LatentNoise":
         """Plan the likeliest components and contact bits along the rollout of the unknowns."""
         noise = torch.unflatten(unknowns.detach(), -1, (context.frames, LAYOUT.continuous))
-        return LatentNoise(context, context.prior.plan(context.expand_state(len(noise)), noise))
+        return LatentNoise(context, context.prior.plan(context.prior_state.expand(len(noise)), noise))
 
     @staticmethod
     def begin_search(context: WindowContext, start: Float[Tensor, "batch unknowns"]) -> "LatentNoise":
         """Plan like `from_unknowns`, for a search that evaluates the start first: its rollout is done only once."""
         noise = torch.unflatten(start.detach(), -1, (context.frames, LAYOUT.continuous))
-        planned = context.prior.plan_search(context.expand_state(len(noise)), noise)
+        planned = context.prior.plan_search(context.prior_state.expand(len(noise)), noise)
         return LatentNoise(context, *planned, holds_heels=True)
 
     def build(self, unknowns: Float[Tensor, "batch unknowns"]) -> Trial:
@@ -144,7 +137,7 @@ class LatentNoise(Parametrisation):
         context = self.context
         noise = torch.unflatten(unknowns, -1, (context.frames, LAYOUT.continuous))
         plan = self._expand_plan(len(noise))
-        features, log_density = context.prior.rollout(context.expand_state(len(noise)), noise, plan)
+        features, log_density = context.prior.rollout(context.prior_state.expand(len(noise)), noise, plan)
         return self._hold_heels(context.build_trial(features, plan.contacts, noise, log_density))
 
     def build_detached(self, unknowns: Float[Tensor, "batch unknowns"]) -> Trial | None:
@@ -172,7 +165,7 @@ class LatentNoise(Parametrisation):
         """Prepare the rollouts of so many candidates, once, and their contacts."""
         if batch not in self._prepared:
             plan = self._expand_plan(batch)
-            rollout = self.context.prior.prepare_rollout(self.context.expand_state(batch), plan)
+            rollout = self.context.prior.prepare_rollout(self.context.prior_state.expand(batch), plan)
             self._prepared[batch] = rollout, plan.contacts
         return self._prepared[batch]
 
@@ -198,9 +191,9 @@ class LatentNoise(Parametrisation):
             self.plan.component.expand(batch, -1).contiguous(), self.plan.contacts.expand(batch, -1, -1).contiguous()
         )
 
-    def warm_start(self, unknowns: Float[Tensor, "1 unknowns"]) -> Float[Tensor, "frames width"]:
-        """Return the noise by frame."""
-        return torch.unflatten(unknowns[0], -1, (self.context.frames, LAYOUT.continuous))
+
+SMOOTH_FRAMES = 2.0
+"""Frames (sigma) over which offsets are smoothed: what moves one frame moves its neighbours along."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,8 +208,6 @@ class PoseOffsets(Parametrisation):
     """Left and right toe planted in each frame."""
     sigma: Float[Tensor, "frames width"]
     """Standard deviations of root, heading and angles (see `BodyPose.pack`): metres and radians."""
-    smooth: float = 2.0
-    """Sigma of the smoothing, frames."""
 
     @cached_property
     def _heel_plan(self) -> Trial:
@@ -226,7 +217,7 @@ class PoseOffsets(Parametrisation):
 
     @cached_property
     def _smoothing_matrix(self) -> Float[Tensor, "frames frames"]:
-        return gaussian.unit_variance_matrix(len(self.sigma), self.smooth, self.sigma.dtype)
+        return gaussian.unit_variance_matrix(len(self.sigma), SMOOTH_FRAMES, self.sigma.dtype)
 
     def build(self, unknowns: Float[Tensor, "batch unknowns"]) -> Trial:
         """Build the trials of the proposal with the offsets added; differentiable."""
@@ -236,10 +227,6 @@ class PoseOffsets(Parametrisation):
         features = pose.features(self.context.ground_pose, self.contacts)
         log_density = None
         if not isinstance(self.context.density, DensityEnsemble):
-            log_density = self.context.density.log_prob(features, self.context.expand_state(len(white)))
+            log_density = self.context.density.log_prob(features, self.context.prior_state.expand(len(white)))
         contacts = self.contacts.expand(len(white), -1, -1)
         return replace(self.context.build_trial(features, contacts, white, log_density), heel_plan=self._heel_plan)
-
-    def warm_start(self, unknowns: Float[Tensor, "1 unknowns"]) -> Float[Tensor, "frames width"]:
-        """Return the white offsets by frame, in sigmas."""
-        return torch.unflatten(unknowns[0], -1, self.sigma.shape)

@@ -1,13 +1,12 @@
 """Solvers of one window: a start, a parametrisation of its frames, and L-BFGS over the unknowns.
 
-The search over a rollout's noise starts at the last window's noise, the best of random draws, or a particle swarm over
-a few numbers that steer: noise at a few knots in time, linear in between. All the noise of a window (34 x 66 numbers)
-is too many dimensions for a swarm.
+The search over a rollout's noise starts at the last window's noise, or at the best of a particle swarm over a few
+numbers that steer: noise at a few knots in time, linear in between. All the noise of a window (34 x 66 numbers) is too
+many dimensions for a swarm.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import TypeAlias
 
 import torch
@@ -16,26 +15,22 @@ from torch import Tensor
 
 from mapctl.features import LAYOUT
 from mapctl.pose import BodyPose
-from mapctl.problem.density_selection import DensityChoice, DensityEnsemble
+from mapctl.problem.density_selection import DensityEnsemble
 from mapctl.problem.objective import Objective, Parametrisation
-from mapctl.problem.solution import Ledger
+from mapctl.problem.solution import Ledger, WindowRecord
 from mapctl.problem.unknowns import LatentNoise, PoseOffsets, WindowRequest
 from mapctl.solver.budget import Budget, Meter
 from mapctl.solver.lbfgs import LbfgsResult, LbfgsSettings, minimise
-from mapctl.solver.swarm import SwarmResult, SwarmSettings, run_best_of_samples, run_swarm
+from mapctl.solver.swarm import SwarmSettings, run_swarm
 from mapctl.terms.base import Term
 from mapctl.terms.likelihood import LatentPrior, Likelihood
 from mapctl.terms.trial import Trial
 
+_STUCK_ENERGY = 8.0
+"""Energy a frame, nats, below which no further round is run: a new round starts without curvature pairs, which pays
+only where the last one is stuck."""
 WarmStartProposal = Callable[[WindowRequest, Float[Tensor, "1 unknowns"], Meter], Float[Tensor, "1 unknowns"]]
 """(request, warm start over the whole window, meter) to the unknowns from which L-BFGS starts."""
-
-
-def keep_warm_start(
-    request: WindowRequest, warm: Float[Tensor, "1 unknowns"], meter: Meter
-) -> Float[Tensor, "1 unknowns"]:
-    """Return the warm start itself."""
-    return warm
 
 
 @dataclass(frozen=True)
@@ -61,40 +56,8 @@ class SteeringKnots:
         noise[..., self._columns()] = dense.transpose(1, 2)
         return noise
 
-    def search(
-        self, method: Callable[..., SwarmResult], request: WindowRequest, warm: Float[Tensor, "1 unknowns"]
-    ) -> Float[Tensor, "1 unknowns"]:
-        """Return the unknowns of the best point about the warm start that a method finds, each under its own plan."""
-
-        def unknowns(points: Float[Tensor, "batch size"]) -> Float[Tensor, "batch unknowns"]:
-            return warm + self.expand(points.to(warm.dtype), request.context.frames).flatten(1)
-
-        def energy(points: Float[Tensor, "batch size"]) -> Float[Tensor, " batch"]:
-            noise = unknowns(points)
-            with torch.no_grad():
-                return Objective(LatentNoise.from_unknowns(request.context, noise).build, request.terms).energy(noise)
-
-        found = method(energy, start=torch.zeros(self.size()), spread=self.spread, generator=request.generator)
-        return unknowns(found.x[None])
-
     def _columns(self) -> list[int]:
         return [i for block in self.blocks for i in range(LAYOUT.slices[block].start, LAYOUT.slices[block].stop)]
-
-
-@dataclass(frozen=True)
-class BestOfSamples:
-    """The best of random draws in the steering space, the warm start among them."""
-
-    count: int = 32
-    """Number of draws."""
-    space: SteeringKnots = SteeringKnots()
-    """Space in which they are drawn."""
-
-    def __call__(
-        self, request: WindowRequest, warm: Float[Tensor, "1 unknowns"], meter: Meter
-    ) -> Float[Tensor, "1 unknowns"]:
-        """Return the best draw; the meter counts what was evaluated."""
-        return self.space.search(partial(run_best_of_samples, count=self.count, meter=meter), request, warm)
 
 
 @dataclass(frozen=True)
@@ -102,15 +65,28 @@ class SwarmProposal:
     """A particle swarm (Wang et al. 2019, section 5.2) in the steering space, started at the warm start."""
 
     settings: SwarmSettings = field(default_factory=SwarmSettings)
-    """Number of particles and iterations."""
+    """Number of particles and iterations; with one iteration the best of random draws."""
     space: SteeringKnots = SteeringKnots()
     """Space in which they move."""
 
     def __call__(
         self, request: WindowRequest, warm: Float[Tensor, "1 unknowns"], meter: Meter
     ) -> Float[Tensor, "1 unknowns"]:
-        """Return the best point of the swarm; the meter counts what was evaluated."""
-        return self.space.search(partial(run_swarm, settings=self.settings, meter=meter), request, warm)
+        """Return the best point of the swarm, each under its own plan; the meter counts what was evaluated."""
+
+        def unknowns(points: Float[Tensor, "batch size"]) -> Float[Tensor, "batch unknowns"]:
+            return warm + self.space.expand(points.to(warm.dtype), request.context.frames).flatten(1)
+
+        def energy(points: Float[Tensor, "batch size"]) -> Float[Tensor, " batch"]:
+            noise = unknowns(points)
+            with torch.no_grad():
+                return Objective(LatentNoise.from_unknowns(request.context, noise).build, request.terms).energy(noise)
+
+        start, spread = torch.zeros(self.space.size()), self.space.spread
+        found = run_swarm(
+            energy, start=start, spread=spread, settings=self.settings, meter=meter, generator=request.generator
+        )
+        return unknowns(found.x[None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,19 +96,11 @@ class SolvedWindow:
     trial: Trial
     """Motion found: batch of one, detached."""
     warm_start: Float[Tensor, "frames width"]
-    """Warm start of the next window, by frame (see `Parametrisation.warm_start`)."""
+    """Unknowns by frame, from which the next window, which overlaps this one, may start."""
     ledger: Ledger
     """Energy and residual by term and frame."""
-    evaluations: int
-    """Number of evaluations, those of warm start proposals included."""
-    start_energy: float
-    """Energy at the start of L-BFGS, nats."""
-    energy: float
-    """Energy of the trial, nats."""
-    stop_reason: str
-    """Reason why L-BFGS stopped."""
-    choice: DensityChoice | None = None
-    """Density of an ensemble that scored the window; None for a single density."""
+    record: WindowRecord
+    """Cost and energies, of all frames; the horizon sets the seconds."""
 
 
 SingleWindowSolver: TypeAlias = Callable[[WindowRequest], SolvedWindow]
@@ -149,9 +117,6 @@ class LatentNoiseSolver:
 
     rounds: int = 3
     """Largest number of rounds."""
-    energy_threshold: float = 8.0
-    """Energy a frame, nats, below which no further round is run: a new round starts without curvature pairs, which pays
-    only where the last one is stuck."""
     lbfgs: LbfgsSettings = field(
         default_factory=lambda: LbfgsSettings(max_iterations=36, relative_energy_tolerance=3e-3)
     )
@@ -159,23 +124,26 @@ class LatentNoiseSolver:
     evaluations in ten, and walks are as near their paths (docs/reference/results.md)."""
     budget: Budget = field(default_factory=lambda: Budget(evaluations=120))
     """Budget of one window."""
-    proposal: WarmStartProposal = keep_warm_start
-    """Proposal of the first round's start."""
+    proposal: WarmStartProposal | None = None
+    """Proposal of the first round's start; None: the warm start itself."""
 
     def __call__(self, request: WindowRequest) -> SolvedWindow:
         """Solve one window."""
         meter, frames = Meter(self.budget.within(request.seconds)), request.context.frames
-        start = self.proposal(request, _extend_warm_start(request), meter)
+        start = _extend_warm_start(request)
+        if self.proposal is not None:
+            start = self.proposal(request, start, meter)
         unknowns, best = self._run_round(request, start, meter)
         start_energy = float(best.start_energy[0])
         for _ in range(self.rounds - 1):
-            if meter.exhausted or not best.energy[0] > self.energy_threshold * frames:
+            if meter.exhausted or not best.energy[0] > _STUCK_ENERGY * frames:
                 break
             replanned, again = self._run_round(request, best.x, meter)
             if not again.energy[0] < best.energy[0]:
                 break
             unknowns, best = replanned, again
-        return replace(_build_solved_window(unknowns, request.terms, best, meter), start_energy=start_energy)
+        solved = _build_solved_window(unknowns, request.terms, best, meter)
+        return replace(solved, record=replace(solved.record, start_energy=start_energy))
 
     def _run_round(self, request: WindowRequest, start: Tensor, meter: Meter) -> tuple[LatentNoise, LbfgsResult]:
         unknowns = LatentNoise.begin_search(request.context, start)
@@ -239,14 +207,12 @@ def _build_solved_window(
 ) -> SolvedWindow:
     objective = Objective.of(unknowns, terms)
     trial = objective.build_detached(result.x)
+    frames, energies = trial.features.shape[1], (float(result.start_energy[0]), float(result.energy[0]))
     return SolvedWindow(
         trial,
-        unknowns.warm_start(result.x),
+        torch.unflatten(result.x[0], -1, (frames, -1)),
         objective.build_ledger(trial),
-        meter.evaluations,
-        float(result.start_energy[0]),
-        float(result.energy[0]),
-        result.status[0].value,
+        WindowRecord(frames, 0.0, meter.evaluations, *energies, outcome=result.status[0].value),
     )
 
 
@@ -264,8 +230,6 @@ class PoseOffsetSolver:
     """Left and right toe planted in each frame of it."""
     sigma: Float[Tensor, "frames width"]
     """Standard deviations of root, heading and angles by frame (see `BodyPose.pack`): metres and radians."""
-    smooth: float = 2.0
-    """Sigma of the smoothing, frames."""
     temperature: float = 1.0
     """Temperature of the selected density's likelihood."""
     lbfgs: LbfgsSettings = field(default_factory=lambda: LbfgsSettings(max_iterations=20))
@@ -290,6 +254,7 @@ class PoseOffsetSolver:
             choice, state = context.density.select(proposal.features(context.ground_pose, contacts), context.state)
             context = replace(context, density=choice.density, state=state)
             terms = (*terms, Likelihood(self.temperature / choice.weight))
-        offsets = PoseOffsets(context, proposal, contacts, self.sigma[first:stop], smooth=self.smooth)
+        offsets = PoseOffsets(context, proposal, contacts, self.sigma[first:stop])
         start, meter = torch.zeros(1, offsets.sigma.numel()), Meter(self.budget.within(request.seconds))
-        return replace(minimise_window(offsets, terms, start, self.lbfgs, meter), choice=choice)
+        solved = minimise_window(offsets, terms, start, self.lbfgs, meter)
+        return replace(solved, record=replace(solved.record, choice=choice))

@@ -14,8 +14,6 @@ class Budget:
     """Evaluations of the energy, with or without gradient; a batch counts every candidate in it."""
     seconds: float | None = None
     """Time from the making of the meter, seconds."""
-    least: int = 0
-    """Number of evaluations allowed however late it is, within `evaluations`."""
     evaluation_seconds: float | None = None
     """Time of an evaluation, seconds, as far as known: one that would end after `seconds` is not begun. Later ones are
     expected to take as long as the last. None asks for the time at the beginning alone."""
@@ -48,13 +46,9 @@ class Meter:
 
     @property
     def remaining(self) -> float:
-        """Evaluations that may still be made: a whole number, at most what is left of `least` after the deadline, or
-        infinity.
-        """
+        """Evaluations that may still be made: a whole number, or infinity; none after the deadline."""
         limit = math.inf if self.budget.evaluations is None else self.budget.evaluations
-        if self._past_deadline():
-            limit = min(limit, self.budget.least)
-        return max(0, limit - self.evaluations)
+        return 0 if self._late() else max(0, limit - self.evaluations)
 
     @property
     def exhausted(self) -> bool:
@@ -62,9 +56,6 @@ class Meter:
         return self._late() or not self._affords(1)
 
     def _late(self, count: int = 1) -> bool:
-        return self._past_deadline(count) and self.evaluations >= self.budget.least
-
-    def _past_deadline(self, count: int = 1) -> bool:
         now = self._clock() - self._began
         return self.budget.seconds is not None and now + count * self._expected >= self.budget.seconds
 

@@ -23,6 +23,9 @@ from torch import Tensor
 from mapctl.errors import RequestError
 from mapctl.solver.budget import Meter
 
+_ARMIJO, _CURVATURE = 1e-4, 0.9
+"""Share of the slope's predicted decrease that a step must keep, and of the starting slope that may be left at its end
+(the weak Wolfe conditions of Nocedal and Wright 2006, section 3.1)."""
 Vector = NDArray[np.float64]
 Point = NDArray[np.floating[Any]]
 """In the caller's precision."""
@@ -51,10 +54,6 @@ class LbfgsSettings:
     """Converged where no entry of the gradient is larger, energy per unit of the unknowns."""
     relative_energy_tolerance: float = 1e-6
     """Energy tolerance: converged where a step wins less than this share of `max(|energy|, 1)`."""
-    armijo: float = 1e-4
-    """Share of the slope's predicted decrease that a step must keep."""
-    curvature: float = 0.9
-    """Share of the starting slope that may be left at a step's end; between `armijo` and 1."""
     max_trials: int = 12
     """Largest number of trial steps in one line search."""
 
@@ -247,9 +246,9 @@ def _line_search(
             break  # the bracket is below the precision of the unknowns
         trial = yield x
         trial.step, trial.slope = step, float(direction @ trial.gradient)
-        if not trial.finite or trial.energy > base.energy + settings.armijo * step * slope + noise:
+        if not trial.finite or trial.energy > base.energy + _ARMIJO * step * slope + noise:
             high = trial
-        elif trial.slope >= settings.curvature * slope:
+        elif trial.slope >= _CURVATURE * slope:
             return trial
         else:
             low = trial

@@ -1,4 +1,4 @@
-"""Particle swarm (Kennedy and Eberhart 1995; Wang et al. 2019, section 5.2) by pyswarms, and a baseline of samples.
+"""Particle swarm (Kennedy and Eberhart 1995; Wang et al. 2019, section 5.2) by pyswarms.
 
 pyswarms' own optimisers keep every iterate, draw first velocities from [0, 1] whatever the unit, and cannot stop at a
 budget; so its update rules are used, and the loop is here. Its import is slow and sets up the process's logging (and a
@@ -20,24 +20,21 @@ from torch import Tensor
 
 from mapctl.solver.budget import Meter
 
+_WEIGHTS = {"w": 0.7298, "c1": 1.4962, "c2": 1.4962}
+"""Share of its velocity that a particle keeps, and its pull toward its own best point and the best of all: largest
+factors of the difference in an iteration (the constriction of Clerc and Kennedy 2002)."""
 Cost = Callable[[Tensor], Tensor]
 """Points (particles, n) to energies (particles,); what is not finite counts as infinity."""
 
 
 @dataclass(frozen=True)
 class SwarmSettings:
-    """Size and weights of a swarm; the default weights are the constriction of Clerc and Kennedy 2002."""
+    """Size of a swarm."""
 
     particles: int = 16
     """Number of points evaluated at once; fewer where the budget has fewer left."""
     iterations: int = 6
-    """Number of evaluations of the whole swarm."""
-    inertia: float = 0.7298
-    """Share of its velocity a particle keeps."""
-    cognitive: float = 1.4962
-    """Pull toward the particle's own best point: largest factor of the difference, each iteration."""
-    social: float = 1.4962
-    """Pull toward the best point of all: largest factor of the difference, each iteration."""
+    """Number of evaluations of the whole swarm; of one evaluation the best sample is the result."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,51 +66,31 @@ def run_swarm(
     meter = Meter() if meter is None else meter
     track = _BestTracker(cost, start, meter)
     points = _sample_points(start, spread, min(settings.particles, meter.remaining), generator)
-    if not len(points):
+    costs = track.evaluate(points) if len(points) else None
+    if costs is None or settings.iterations < 2:
         return track.result()
     seed = torch.randint(2**32, (8,), generator=generator, device=generator.device).cpu().numpy()
     random, (operators, make_swarm) = np.random.RandomState(seed), _import_pyswarms()
-    first, weights = _to_numpy(points), {"w": settings.inertia, "c1": settings.cognitive, "c2": settings.social}
-    swarm = make_swarm(first, np.zeros_like(first), options=weights)
+    first = _to_numpy(points)
+    swarm = make_swarm(first, np.zeros_like(first), options=_WEIGHTS)
     swarm.pbest_cost, swarm.best_pos, swarm.best_cost = np.full(len(first), np.inf), first[0], np.inf
-    for iteration in range(settings.iterations):
-        if iteration:
-            with _use_numpy_state(random):
-                swarm.velocity = operators.compute_velocity(swarm, None, _keep_velocity)
-            swarm.position = operators.compute_position(swarm, None, None)
-        swarm.current_cost = track.evaluate(torch.as_tensor(swarm.position).to(start))
-        if swarm.current_cost is None:
-            break
+    for _ in range(settings.iterations - 1):
+        swarm.current_cost = costs
         swarm.pbest_pos, swarm.pbest_cost = operators.compute_pbest(swarm)
         best = int(swarm.pbest_cost.argmin())
         if swarm.pbest_cost[best] < swarm.best_cost:
             swarm.best_pos, swarm.best_cost = swarm.pbest_pos[best], swarm.pbest_cost[best]
+        with _use_numpy_state(random):
+            swarm.velocity = operators.compute_velocity(swarm, None, _keep_velocity)
+        swarm.position = operators.compute_position(swarm, None, None)
+        costs = track.evaluate(torch.as_tensor(swarm.position).to(start))
+        if costs is None:
+            break
     return track.result()
 
 
 def _keep_velocity(velocity: np.ndarray, clamp: None, **_: object) -> np.ndarray:
     return velocity
-
-
-def run_best_of_samples(
-    cost: Cost,
-    *,
-    start: Float[Tensor, " n"],
-    spread: Float[Tensor, " n"] | float,
-    count: int,
-    meter: Meter | None = None,
-    generator: torch.Generator,
-) -> SwarmResult:
-    """Find the best of `count` points, evaluated at once: the start and samples around it; fewer on a short budget.
-
-    `spread` is the standard deviation of the samples, in units of the unknowns.
-    """
-    meter = Meter() if meter is None else meter
-    track = _BestTracker(cost, start, meter)
-    points = _sample_points(start, spread, min(count, meter.remaining), generator)
-    if len(points):
-        track.evaluate(points)
-    return track.result()
 
 
 class _BestTracker:

@@ -63,10 +63,7 @@ class Path:
     def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
         """Add the gradient of the summed energies of a float32 trial, and return the energies, nats."""
         positions, energy = self._positions(trial).contiguous(), np.empty(gradient.log_density.shape)
-        near, sigma = self._nearest_frame(positions), self.slow_seconds * trial.fps
-        known, weights = _build_offset_smoother(
-            self, trial.before, trial.skeleton.index(self.joint), sigma, positions.dtype
-        )
+        near, (known, weights) = self._nearest_frame(positions), self._build_smoother(trial, positions.dtype)
         pulled = np.zeros(tuple(positions.shape), np.float32)
         points = (each.numpy() for each in (positions, near.tangent_extension, near.axes, known, weights))
         sigmas = (self.sigma_raw, self.sigma_progress, self.sigma_height)
@@ -103,11 +100,12 @@ class Path:
 
     def _low_pass_offset(self, trial: Trial, sideways: Tensor) -> Tensor:
         """The sideways offset smoothed over time, with the frames before the window that there are."""
-        sigma = self.slow_seconds * trial.fps
-        known, weights = _build_offset_smoother(
-            self, trial.before, trial.skeleton.index(self.joint), sigma, sideways.dtype
-        )
+        known, weights = self._build_smoother(trial, sideways.dtype)
         return torch.addmm(known, sideways, weights)
+
+    def _build_smoother(self, trial: Trial, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+        sigma_frames, joint = self.slow_seconds * trial.fps, trial.skeleton.index(self.joint)
+        return _build_offset_smoother(self, trial.before, joint, sigma_frames, dtype)
 
     def past_sideways_offsets(self, past: Float[Tensor, "past 3"]) -> Float[Tensor, " past"]:
         """Return the sideways offsets of the frames before the window, metres; their arcs are extrapolated."""

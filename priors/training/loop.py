@@ -1,11 +1,8 @@
 """The training loop of every model: steps, validation, early stopping, checkpoints, and at the end weights and card.
 
 A recipe (`priors.training.recipes`) is a class of settings, which are the options of `mapctl train MODEL` too, and a
-trainer that takes the steps. A run folder holds `checkpoint.safetensors`, from which training resumes, `losses.csv` and
-`tensorboard/`, the features of the clips in `cache/`, and at the end `model.safetensors` with its card, `model.json`.
-
-Under torchrun every process draws windows of its own and torch's DistributedDataParallel averages the gradients; the
-first process validates, reports and writes.
+trainer that takes the steps. A run folder holds `checkpoint.safetensors`, from which training resumes, `losses.csv`,
+the features of the clips in `cache/`, and at the end `model.safetensors` with its card, `model.json`.
 """
 
 import csv
@@ -20,14 +17,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from datetime import timedelta
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
-from torch import Tensor, distributed, nn
-from torch.nn.parallel import DistributedDataParallel
+from torch import Tensor, nn
 from tyro.conf import Fixed, Suppress, arg
 
 from mapctl.errors import CheckpointError, MapctlError, RequestError, WriteError
@@ -39,8 +34,8 @@ from priors.checkpoints import NetworkConfig, require_at_least, write_tensors
 from priors.training.data import Split, read_corpus, split_corpus
 from priors.weight_sets import OF_DATA, name_for_records
 
-CHECKPOINT, LOSSES, EVENTS = "checkpoint.safetensors", "losses.csv", "tensorboard"
-"""Files and folder of a run folder."""
+CHECKPOINT, LOSSES = "checkpoint.safetensors", "losses.csv"
+"""Files of a run folder."""
 TRAINING, VALIDATION = "training", "validation"
 """Values of the column `part` of LOSSES: mean losses since the last report, or measures of held-out clips."""
 _FIRST_LINE_SECONDS, _LINE_SECONDS = 5.0, 30.0  # to the first line on the losses, and from line to line
@@ -76,8 +71,6 @@ class Settings(ABC):
     """How commands take what was trained."""
     keeps_best: ClassVar[bool] = False
     """Whether the weights of the best validation are exported even without `patience`."""
-    uses_gpu: ClassVar[bool] = True
-    """Whether it can be trained on a GPU, and by several processes."""
     single_thread: ClassVar[bool] = True
     """Whether training is fastest on one thread."""
 
@@ -175,7 +168,7 @@ class Settings(ABC):
         corpus = read_corpus(
             self.data, match=self.chosen, cache=self.out / "cache", cuts=self.cuts, level=self.level, report=self.report
         )
-        if corpus.skipped and is_main():
+        if corpus.skipped:
             reasons = [f"{self.data / name}: {reason}" for name, reason in corpus.skipped.items()]
             rest = f"; all in {self.out / 'skipped.txt'}" if len(reasons) > _MOST_NAMED else ""
             found = f"left out {len(reasons)} of {len(reasons) + len(corpus.names)} files"
@@ -189,7 +182,7 @@ class Settings(ABC):
 
     def report(self, line: str) -> None:
         """Print a line at once, so that a log file shows how far a run of hours has come."""
-        if not self.quiet and is_main():
+        if not self.quiet:
             print(line, flush=True)
 
 
@@ -268,7 +261,7 @@ class Trainer(ABC, Generic[Network]):
 
     def __init__(self, settings: Any):
         self.settings, self.step, self.steps = settings, 0, settings.steps
-        self.generator = make_generator(settings.seed + count_processes()[0])
+        self.generator = make_generator(settings.seed)
 
     @abstractmethod
     def train_step(self) -> dict[str, float]:
@@ -322,10 +315,10 @@ class Trainer(ABC, Generic[Network]):
 
     def load_state(self, tensors: Mapping[str, Tensor], step: int) -> None:
         """Go on from what `state` returned; KeyError or RuntimeError where it is not whole."""
-        if tensors["generator"].shape == self.generator.get_state().shape and is_main():
+        if tensors["generator"].shape == self.generator.get_state().shape:
             self.generator.set_state(tensors["generator"])
-        else:  # that of another kind of device or of another process
-            self.generator.manual_seed(self.settings.seed + 7919 * step + count_processes()[0])
+        else:  # that of another kind of device
+            self.generator.manual_seed(self.settings.seed + 7919 * step)
         for kind, network in self.networks().items():
             network.load_state_dict(select_prefixed(f"{kind}.", tensors))
         for kind, optimiser in self.optimisers().items():
@@ -345,7 +338,6 @@ class GradientTrainer(Trainer[Network]):
         super().__init__(settings)
         self.network = draw_weights(make, settings.seed).to(torch.get_default_device())
         self._optimisers = self.make_optimisers()
-        self._parallel: Callable[[], dict[str, Tensor]] | None = None
 
     @property
     def progress(self) -> float:
@@ -378,17 +370,12 @@ class GradientTrainer(Trainer[Network]):
 
     def train_step(self) -> dict[str, float]:
         """Take one update; return the parts of its loss. MapctlError, and no update, where that is not finite."""
-        if self._parallel is None:
-            alone = count_processes()[1] == 1
-            self._parallel = (
-                self.losses if alone else DistributedDataParallel(_Losses(self), find_unused_parameters=True)
-            )
         optimisers = self._optimisers.values()
         for optimiser in optimisers:
             for group in optimiser.param_groups:
                 group["lr"] = self.compute_learning_rate()
             optimiser.zero_grad(set_to_none=True)
-        losses = self._parallel()
+        losses = self.losses()
         losses["loss"].backward()
         parts = {name: float(value.detach()) for name, value in losses.items()}
         if not math.isfinite(parts["loss"]):
@@ -418,18 +405,6 @@ class GradientTrainer(Trainer[Network]):
                     value.lerp_(before[name].to(value), self.settings.init_share)
 
 
-class _Losses(nn.Module):
-    """The losses of a trainer as the module that DistributedDataParallel runs."""
-
-    def __init__(self, trainer: GradientTrainer[Any]):
-        super().__init__()
-        self.networks = nn.ModuleDict(trainer.networks())
-        self.compute = trainer.losses
-
-    def forward(self) -> dict[str, Tensor]:
-        return self.compute()
-
-
 def train(settings: Settings) -> Path:
     """Train to the end, or until validation no longer improves, and write RUN/model.safetensors; return its path.
 
@@ -442,12 +417,8 @@ def train(settings: Settings) -> Path:
         raise CheckpointError(f"{settings.out} holds no checkpoint to resume from")
     if present and not settings.resume:
         raise RequestError(f"{settings.out} already holds a run; pass --resume to continue, or choose another folder")
-    with _join_processes(settings), use_device(settings.find_device()):
-        if not is_main():
-            distributed.barrier()  # until the first process has read the clips, and the others find its cache
+    with use_device(settings.find_device()):
         parts = settings.gather()
-        if is_main() and count_processes()[1] > 1:
-            distributed.barrier()
         held = parts.to(torch.get_default_device().type)
         trainer = settings.make_trainer(held)
         keeps_best = settings.keeps_best or settings.patience > 0
@@ -470,17 +441,11 @@ def train(settings: Settings) -> Path:
             measured = curve[-1]["step"] if curve else 0
             on_time = (last or trainer.step % settings.validate_steps == 0) and trainer.step > measured
             if stopped is None and (on_time or (keeps_best and not curve)):
-                if is_main():
-                    row = _finite(trainer.validate(held.validation))
-                    log.write(trainer.step, VALIDATION, row)
-                    shown = ", ".join(f"{name} {'-' if v is None else f'{v:.4g}'}" for name, v in row.items())
-                    settings.report(f"validation at step {trainer.step}: {shown}")
-                else:
-                    row = {}
-                rows = [row]  # the first process' for all
-                if count_processes()[1] > 1:
-                    distributed.broadcast_object_list(rows)
-                curve.append({"step": trainer.step, **rows[0]})
+                row = _finite(trainer.validate(held.validation))
+                log.write(trainer.step, VALIDATION, row)
+                shown = ", ".join(f"{name} {'-' if v is None else f'{v:.4g}'}" for name, v in row.items())
+                settings.report(f"validation at step {trainer.step}: {shown}")
+                curve.append({"step": trainer.step, **row})
                 scores = [math.inf if math.isnan(score) else score for score in map(trainer.score, curve)]
                 if keeps_best and all(scores[-1] < before for before in scores[:-1]):
                     best = _copy_weights(trainer.exported)
@@ -488,7 +453,7 @@ def train(settings: Settings) -> Path:
                     stopped = f"no better in {settings.patience} validations"
             overdue = time.monotonic() - saved > 60 * settings.checkpoint_minutes
             # A run that was stopped keeps its last checkpoint: resumed from there it comes to the same end.
-            if trainer.step and stopped is None and (last or overdue) and is_main():
+            if trainer.step and stopped is None and (last or overdue):
                 _check_finite(trainer)
                 kept = {f"best.{name}": value for name, value in best.items()}
                 index = {"step": trainer.step, "identity": identity, "curve": curve}
@@ -508,14 +473,12 @@ def train(settings: Settings) -> Path:
             if last or trainer.step % settings.report_steps == 0:
                 log.write(trainer.step, TRAINING, _average(losses))
                 losses = []
-        log.close()
         if stopped is not None:
             settings.report(f"{stopped}: training ends with the best weights so far")
         if keeps_best:
             trainer.exported.load_state_dict(best)
         path = settings.out / "model.safetensors"
-        if is_main():
-            _export(settings, trainer, parts, curve, stopped, path)
+        _export(settings, trainer, parts, curve, stopped, path)
         return path
 
 
@@ -598,23 +561,17 @@ def _explain_unreadable(run: Path) -> Iterator[None]:
 
 
 class Log:
-    """Mean losses and measures of held-out clips, as RUN/losses.csv and, where it is installed, for TensorBoard."""
+    """Mean losses and measures of held-out clips, as RUN/losses.csv."""
 
     def __init__(self, run: Path, step: int):
         """Rows beyond `step`, at which the run goes on, are dropped: they come again."""
-        self._path, self._rows, self._events = run / LOSSES, [], None
+        self._path, self._rows = run / LOSSES, []
         if step and self._path.exists():
             with self._path.open(encoding="utf-8", newline="") as file:
                 self._rows = [row for row in csv.DictReader(file) if int(row["step"]) <= step]
-        if is_main() and find_spec("tensorboard") is not None:
-            from torch.utils.tensorboard.writer import SummaryWriter  # an optional extra, slow to import
-
-            self._events = SummaryWriter(str(run / EVENTS), purge_step=step + 1 if step else None)
 
     def write(self, step: int, part: str, values: Mapping[str, Any]) -> None:
         """Add a row; values that are not finite numbers are left out."""
-        if not is_main():
-            return
         finite = {name: value for name, value in _finite(values).items() if value is not None}
         self._rows.append({"step": str(step), "part": part, **{name: f"{v:.9g}" for name, v in finite.items()}})
         text = io.StringIO()
@@ -624,43 +581,6 @@ class Log:
         table.writeheader()
         table.writerows(self._rows)
         write_text(self._path, text.getvalue())
-        if self._events is not None:
-            for name, value in finite.items():
-                self._events.add_scalar(f"{part}/{name}", value, step)
-            self._events.flush()
-
-    def close(self) -> None:
-        """Close the event files."""
-        if self._events is not None:
-            self._events.close()
-
-
-def count_processes() -> tuple[int, int]:
-    """Return the number of this process, and how many train together (1 unless torchrun started them)."""
-    return int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
-
-
-def is_main() -> bool:
-    """Whether this process validates, reports and writes."""
-    return count_processes()[0] == 0
-
-
-@contextmanager
-def _join_processes(settings: Settings) -> Iterator[None]:
-    """Join the processes that torchrun started, if it did."""
-    if count_processes()[1] == 1:
-        yield
-        return
-    if not settings.uses_gpu:
-        raise RequestError(f"a {settings.kind} is trained by one process")
-    on_gpu = settings.find_device() == "cuda"
-    if on_gpu:
-        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
-    distributed.init_process_group("nccl" if on_gpu else "gloo")
-    try:
-        yield
-    finally:
-        distributed.destroy_process_group()
 
 
 @contextmanager

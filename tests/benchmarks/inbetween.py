@@ -71,9 +71,9 @@ def list_methods(model: str, peer: str) -> dict[str, Method]:
 
     def by(name: str, refine: bool) -> Method:
         inbetweener = priors.load_inbetweener(name)
-        settings = controllers.InfillSettings(refine=refine)
+        refinement = controllers.INFILL_REFINEMENT if refine else None
         return lambda motion, start, stop: (
-            controllers.infill(motion, inbetweener, [Mask(ALL, start, stop)], settings=settings).motion
+            controllers.infill(motion, inbetweener, [Mask(ALL, start, stop)], refinement=refinement).motion
         )
 
     methods: dict[str, Method] = {"slerp": interpolate, "slerp, Hermite": interpolate_smoothly}

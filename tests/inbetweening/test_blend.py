@@ -6,13 +6,12 @@ from fractions import Fraction
 import pytest
 import torch
 from helpers import bandai_skeleton, generator, walk
-from methods import UNFINISHED
 from performers import TOES, Performer
 from rig_maker import Make, make, names_of
 from tiny_infiller import tiny_infiller
 
 from controllers.inbetweening.blend import LimbTransfer, blend
-from controllers.inbetweening.infill import ChainSettings, chain
+from controllers.inbetweening.infill import chain
 from controllers.inbetweening.proposers import SlerpInbetweener
 from mapctl import retarget, rotations
 from mapctl.metrics import body
@@ -39,7 +38,7 @@ def test_frames_are_the_other_clips_own(own, other):
     start, stop, at = round(0.5 * other), round(1.0 * other), 2 * own
     still = replace(waving(own), local_quat_xyzw=waving(own).local_quat_xyzw[:1].expand(4 * own, -1, -1))
     transfer = LimbTransfer(("lefthand",), start, stop, at)
-    done = blend(still, waving(other), transfer, tiny_infiller(), settings=UNFINISHED).motion
+    done = blend(still, waving(other), transfer, tiny_infiller(), refinement=None).motion
     arm = (done.joint_positions()[:, HAND] - done.joint_positions()[:, ARM])[at : at + round(0.5 * own)]
     wanted = 0.5 + torch.arange(len(arm), dtype=torch.float64) / own
     torch.testing.assert_close(torch.atan2(-arm[:, 1], arm[:, 0]), wanted, atol=1e-3, rtol=0)
@@ -62,7 +61,7 @@ def test_a_borrowed_limb_goes_there_and_comes_back_as_bodies_do(fps, margin):
         source,
         LimbTransfer(("leftHand",), 8, 28, 70 * fps // 30, margin=margin),
         tiny_infiller(),
-        settings=UNFINISHED,
+        refinement=None,
     )
     own, theirs, result = peaks_of(motion), peaks_of(source), peaks_of(done.motion)
     assert result.step < max(1.3 * max(own.step, theirs.step), 0.17)
@@ -84,10 +83,7 @@ def others_walk() -> Motion:
 
 
 def test_pieces_of_a_chain_stand_on_the_first_ones_floor():
-    settings = ChainSettings(piece=40, gap=(10, 10))
-    done = chain(
-        [own_walk(), others_walk()], SlerpInbetweener(), settings=settings, filling=UNFINISHED, generator=generator()
-    )
+    done = chain([own_walk(), others_walk()], SlerpInbetweener(), gap=(10, 10), refinement=None, generator=generator())
     toes = retarget.to_canonical(done.motion)[0].joint_positions()[:, TOES, 1]
     for piece in (slice(0, 40), slice(50, 90)):
         torch.testing.assert_close(toes[piece].amin(0), torch.full((2,), TOE_REST_HEIGHT).double(), atol=0.01, rtol=0)

@@ -7,12 +7,12 @@ import pytest
 import torch
 from captures import apart_deg, error_cm, on_rig, swaying, vectors
 from helpers import generator, quat_xyzw, random_motion, tiny_density, walk
-from methods import UNFINISHED, by_method
+from methods import by_method
 from tiny_infiller import tiny_infiller
 from tiny_path import ToldPath, tiny_path
 
 from controllers import retraced
-from controllers.inbetweening.infill import InfillSettings, infill
+from controllers.inbetweening.infill import infill
 from controllers.inbetweening.pipeline import CanonicalClip, take_simpler
 from controllers.inbetweening.proposers import STANDING_STILL, AutoInbetweener, SlerpInbetweener, hold_planted
 from controllers.inbetweening.tween import tween
@@ -20,12 +20,13 @@ from mapctl import contacts, retarget, rotations
 from mapctl.errors import RequestError
 from mapctl.inbetweening import GapQuery, PositionImage, Proposal, ProposedPositions
 from mapctl.inbetweening.missing import interpolate_missing
+from mapctl.inbetweening.position_image import propose_from_positions
 from mapctl.inbetweening.query import estimate_contact_logits
 from mapctl.inbetweening.root_trajectory import close_path
 from mapctl.intent.keyframes import Keys
 from mapctl.motion import Motion
 from mapctl.numerics.smooth_offsets import blend_seams_in_positions, blend_seams_in_rotations
-from mapctl.protocols import Inbetweener, PositionInfiller
+from mapctl.protocols import Inbetweener
 from mapctl.recording.masks import ALL, ROOT, Mask, MissingMask, restore_observed
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, leg_length
 
@@ -34,8 +35,8 @@ RIGS = ("canonical", "bandai", "daz")
 
 def filled(motion, *masks, method="infiller", drawn=0.2, infiller=None, **options):
     network = infiller if infiller is not None else tiny_infiller(drawn=drawn)
-    inbetweener, settings = by_method(method, network)
-    return infill(motion, inbetweener, masks, settings=settings, **options)
+    inbetweener, refinement = by_method(method, network)
+    return infill(motion, inbetweener, masks, refinement=refinement, **options)
 
 
 def seconds(motion, *edges):
@@ -95,10 +96,13 @@ def test_what_stands_in_the_gap_does_not_matter(rig, method):
 
 
 @dataclass(frozen=True)
-class Oracle(PositionInfiller):
+class Oracle(Inbetweener):
     """Knows the motion."""
 
     truth: Motion
+
+    def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
+        return propose_from_positions(query, self.complete, "oracle")
 
     def complete(self, image: PositionImage) -> ProposedPositions:
         """The true places; where there is a moment more than at 30 a second it is that of the very end."""
@@ -273,7 +277,7 @@ class Guess(Inbetweener):
 
 def fill(motion, inbetweener, *masks):
     """Frames are refined by no MAP stage, so that what is seen is the shrinkage."""
-    return infill(motion, inbetweener, list(masks), settings=InfillSettings(refine=False))
+    return infill(motion, inbetweener, list(masks), refinement=None)
 
 
 def error(result, truth, frames):
@@ -434,7 +438,7 @@ def test_a_true_prediction_gives_back_the_way_and_what_is_known_stays_to_the_bit
     motion = on_rig(rig, RETRACED_FRAMES * fps // 30, fps=fps)
     start, stop = fps // 2, 2 * fps
     masks = [Mask(ROOT, start, stop)]
-    done = retraced(elsewhere(motion, start, stop), told_by(motion), masks, settings=UNFINISHED)
+    done = retraced(elsewhere(motion, start, stop), told_by(motion), masks, refinement=None)
     assert float((hips_of(done.motion) - hips_of(motion)).norm(dim=-1).max()) < (0.005 if fps == 30 else 0.01)
     assert_known_stays(motion, done.motion, masks)
     assert torch.equal(done.motion.local_quat_xyzw, motion.local_quat_xyzw)
@@ -443,9 +447,7 @@ def test_a_true_prediction_gives_back_the_way_and_what_is_known_stays_to_the_bit
 @pytest.mark.parametrize("edges", [(20, 60), (0, 50), (30, RETRACED_FRAMES), (0, RETRACED_FRAMES)])
 def test_where_the_hips_were_while_they_are_lost_does_not_matter(edges):
     motion, masks = walk(RETRACED_FRAMES), [Mask(ROOT, *edges)]
-    found = [
-        retraced(each, tiny_path(), masks, settings=UNFINISHED).motion for each in (motion, elsewhere(motion, *edges))
-    ]
+    found = [retraced(each, tiny_path(), masks, refinement=None).motion for each in (motion, elsewhere(motion, *edges))]
     assert torch.equal(found[0].root_position, found[1].root_position)
     assert bool(found[0].root_position.isfinite().all())
 
@@ -480,4 +482,4 @@ def test_standing_is_not_moved_by_residuals_of_the_walk_after_it():
 )
 def test_masks_that_do_not_fit_are_refused(masks, message):
     with pytest.raises(RequestError, match=message):
-        retraced(walk(RETRACED_FRAMES), tiny_path(), masks, inbetweener=SlerpInbetweener(), settings=UNFINISHED)
+        retraced(walk(RETRACED_FRAMES), tiny_path(), masks, inbetweener=SlerpInbetweener(), refinement=None)

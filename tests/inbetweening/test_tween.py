@@ -2,13 +2,14 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
 from captures import apart_deg, on_rig
 from helpers import generator, random_motion, tiny_density, walk
 from linear_inbetweener import LinearInbetweener
-from methods import UNFINISHED, by_method
+from methods import by_method
 from rig_maker import Make, make, names_of
 from tiny_infiller import tiny_infiller
 from tiny_prior import save_tiny_prior
@@ -18,11 +19,10 @@ import mapctl
 import priors
 from controllers.inbetweening.infill import infill
 from controllers.inbetweening.keyframes import build_keyframe_clip, missing_between_keys
-from controllers.inbetweening.pipeline import INFILL_REFINEMENT, CanonicalClip, InfillSettings
+from controllers.inbetweening.pipeline import INFILL_REFINEMENT, CanonicalClip
 from controllers.inbetweening.proposers import (
     AutoInbetweener,
     RolloutInbetweener,
-    RolloutSettings,
     SlerpInbetweener,
     lay_curve,
     propose_through_keys,
@@ -52,8 +52,8 @@ HIPS = {"canonical": "hips", "bandai": "Hips", "daz": "hip"}
 
 
 def made_of(motion, frames, *, method="infiller", drawn=0.02, **given):
-    inbetweener, settings = by_method(method, tiny_infiller(drawn=drawn))
-    return tween(motion, Keys.of(tuple(frames), **given), inbetweener, settings=settings)
+    inbetweener, refinement = by_method(method, tiny_infiller(drawn=drawn))
+    return tween(motion, Keys.of(tuple(frames), **given), inbetweener, refinement=refinement)
 
 
 def frames_of(fps):
@@ -246,8 +246,8 @@ def peaks_of(motion):
 
 
 def asked(motion, keys, *, method="infiller", drawn=0.0):
-    inbetweener, settings = by_method(method, tiny_infiller(drawn=drawn))
-    return tween(motion, Keys(keys), inbetweener, settings=settings)
+    inbetweener, refinement = by_method(method, tiny_infiller(drawn=drawn))
+    return tween(motion, Keys(keys), inbetweener, refinement=refinement)
 
 
 HIGH, LOW = (0.5, 1.5, 0.3), (0.25, 0.35, 0.5)
@@ -345,12 +345,12 @@ def test_a_half_is_met_to_the_bit_and_the_other_does_not_count(rig, fps, half):
     given = {name for name, own in rigmap.joints.items() if not missing.joints[0, own]}
     legs = {name for name in rigmap.joints if name.endswith(("Leg", "Foot", "Toes"))}
     assert given == ((set(rigmap.joints) - legs) if half == "upper" else {"hips", *legs})
-    result = tween(motion, keys, tiny_tweener(), settings=UNFINISHED)
+    result = tween(motion, keys, tiny_tweener(), refinement=None)
     known = ~missing.joints
     assert torch.equal(result.motion.local_quat_xyzw[known], motion.local_quat_xyzw[known])
     assert torch.equal(result.motion.root_position[~missing.root], motion.root_position[~missing.root])
     assert all(row["missed_cm"] < 1e-6 for row in measure_keyframe_errors(result.motion, motion, keys))
-    again = tween(corrupted(motion, missing), keys, tiny_tweener(), settings=UNFINISHED)
+    again = tween(corrupted(motion, missing), keys, tiny_tweener(), refinement=None)
     assert torch.equal(result.motion.local_quat_xyzw, again.motion.local_quat_xyzw)
 
 
@@ -359,8 +359,8 @@ def test_a_half_is_met_to_the_bit_and_the_other_does_not_count(rig, fps, half):
 def test_places_alone_are_met_and_nothing_else_of_the_motion_counts(rig, fps, method):
     motion = on_rig(rig, round(1.5 * fps), fps=fps)
     keys = Keys(tuple(Key(frame, **POSITION) for frame in frames_of(fps)))
-    by, settings = by_method(method, tiny_tweener() if method == "infiller" else tiny_infiller(drawn=0.02))
-    result = tween(motion, keys, by, settings=settings)
+    by, refinement = by_method(method, tiny_tweener() if method == "infiller" else tiny_infiller(drawn=0.02))
+    result = tween(motion, keys, by, refinement=refinement)
     rows = measure_keyframe_errors(result.motion, motion, keys)
     assert [row["what"] for row in rows] == ["place"] * 4
     assert all(row["missed_cm"] < 1e-6 for row in rows)
@@ -396,7 +396,7 @@ def test_drawn_keys_are_met_as_nearly_as_bones_allow(rig, fps):
             Key(last, drawing=drawing_of(canonical, last, view_deg=110, names=torso)),
         )
     )
-    result = tween(motion, keys, tiny_tweener(), settings=UNFINISHED)
+    result = tween(motion, keys, tiny_tweener(), refinement=None)
     rows = measure_keyframe_errors(result.motion, motion, keys)
     assert [row["what"] for row in rows] == ["drawing", "drawing"]
     assert max(row["drawn_cm"] for row in rows) < 3
@@ -446,10 +446,10 @@ def test_auto_walks_over_root_keys_where_a_density_does_with_a_note(tmp_path):
     keys = Keys((Key(0, root_only="place"), Key(59, root_only="place")))
     density = priors.load(str(save_tiny_prior(tmp_path / "prior.safetensors")))
     auto = AutoInbetweener(SlerpInbetweener(), [density], tweener=tiny_tweener())
-    result = tween(motion, keys, auto, settings=InfillSettings(refine=False))
+    result = tween(motion, keys, auto, refinement=None)
     assert all(row["missed_cm"] < 1e-6 for row in measure_keyframe_errors(result.motion, motion, keys))
     assert result.gap_notes[0].startswith("frames 0:60: walk of ")
-    whole = tween(motion, Keys((0, keys.each[1])), auto, settings=InfillSettings(refine=False))
+    whole = tween(motion, Keys((0, keys.each[1])), auto, refinement=None)
     assert not any("walk of" in note for note in whole.gap_notes)
 
 
@@ -476,7 +476,7 @@ def canonical_of(found):
 
 def build_and_tween(request):
     found = build_keyframe_clip(request)
-    done = tween(found.motion, found.keys, tiny_infiller(drawn=0.02), rig=found.rig, settings=UNFINISHED)
+    done = tween(found.motion, found.keys, tiny_infiller(drawn=0.02), rig=found.rig, refinement=None)
     return found, done
 
 
@@ -550,17 +550,21 @@ def test_what_is_not_there_is_named_with_its_key(poses, key, said):
 
 FRAMES, KEYS = 45, (0, 20, 23, 44)
 FEW_FRAMES, FEW_KEYS = 25, (0, 10, 13, 24)
-FEW = InfillSettings(refinement=replace(INFILL_REFINEMENT, budget=Budget(evaluations=4)))
-QUICK = RolloutSettings(
+FEW = replace(INFILL_REFINEMENT, budget=Budget(evaluations=4))
+QUICK = partial(
+    RolloutInbetweener,
     ahead=4,
     jump=math.inf,  # a small density of drawn weights does nothing else
-    method=LatentNoiseSolver(
+    solver=LatentNoiseSolver(
         rounds=1,
         lbfgs=LbfgsSettings(max_iterations=4),
         budget=Budget(evaluations=10),
         proposal=SwarmProposal(SwarmSettings(particles=4, iterations=1)),
     ),
 )
+
+
+JUMPING = partial(QUICK, jump=0.0, least_jump=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -578,11 +582,11 @@ INFILLER = tiny_infiller(drawn=0.02)
 
 def making(motion, keys):
     """Tweens of one motion by whoever is varied."""
-    return lambda inbetweener, draws: tween(motion, keys, inbetweener, settings=FEW, generator=draws)
+    return lambda inbetweener, draws: tween(motion, keys, inbetweener, refinement=FEW, generator=draws)
 
 
 def varied(motion, prior, *, count=3, seed=0, keys=KEYS, rolling=QUICK, **given):
-    make, rollouts = making(motion, Keys.of(keys, **given)), RolloutInbetweener([prior], INFILLER, rolling)
+    make, rollouts = making(motion, Keys.of(keys, **given)), rolling([prior], INFILLER)
     first = AutoInbetweener(INFILLER, [prior])
     return sample_variations(make, first, rollouts, count, generator=generator(seed))
 
@@ -607,7 +611,7 @@ def test_a_rollout_changes_nothing_that_is_known_or_has_no_end():
     motion = on_rig("canonical", FRAMES)
     gap = CanonicalClip.of(motion, keyed(motion, (*range(5, 20), *range(30, 40)))).query()
     logits = SlerpInbetweener().propose(gap).contact_logits
-    answer = RolloutInbetweener([tiny_density()], SlerpInbetweener(), QUICK).propose(gap, generator=generator(0))
+    answer = QUICK([tiny_density()], SlerpInbetweener()).propose(gap, generator=generator(0))
     result, bits = answer.motion, answer.contact_logits
     assert [(source.start, source.stop) for source in answer.attribute(gap)] == [(20, 30)]
     same = torch.ones(FRAMES, dtype=torch.bool)
@@ -622,8 +626,7 @@ def test_a_gap_in_which_every_rollout_jumps_is_left_to_the_fallback():
     motion = on_rig("canonical", FRAMES)
     missing = keyed(motion, (*range(20), *range(30, FRAMES)))
     gap = CanonicalClip.of(motion, missing).query()
-    jumping = replace(QUICK, jump=0.0, least_jump=0.0)
-    answer = RolloutInbetweener([tiny_density()], SlerpInbetweener(), jumping).propose(gap, generator=generator(0))
+    answer = JUMPING([tiny_density()], SlerpInbetweener()).propose(gap, generator=generator(0))
     (source,) = answer.attribute(gap)
     assert (source.by, source.reason) == ("slerp", "every rollout jumped")
     plain = SlerpInbetweener().propose(gap).motion.local_quat_xyzw
@@ -634,7 +637,7 @@ def test_a_gap_in_which_every_rollout_jumps_is_left_to_the_fallback():
 def test_an_end_is_extended_by_a_density_and_a_beginning_never(prior, frames):
     motion, masks = on_rig("bandai", FRAMES), [Mask("*", 0, 2), Mask("*", *frames)]
     plain, result, again = (
-        infill(motion, inbetweener, masks, settings=UNFINISHED)
+        infill(motion, inbetweener, masks, refinement=None)
         for inbetweener in (INFILLER, *[AutoInbetweener(INFILLER, [prior])] * 2)
     )
     known = ~result.missing.frames
@@ -660,7 +663,7 @@ def test_what_leaves_nothing_to_vary_is_refused(prior):
     with pytest.raises(RequestError, match="leaves nothing to vary"):
         varied(motion.slice(0, 6), prior, keys=(0, 5))
     with pytest.raises(RequestError, match="every rollout jumped between these keys, which leaves nothing to vary"):
-        varied(motion, prior, rolling=replace(QUICK, jump=0.0, least_jump=0.0))
+        varied(motion, prior, rolling=JUMPING)
     for count in (1, 1001):
         with pytest.raises(RequestError, match=f"variations are 2 to 1000, got {count}"):
             varied(motion, prior, count=count)

@@ -16,6 +16,7 @@ from mapctl.numerics.intervals import true_intervals
 from mapctl.pose import BodyPose
 from mapctl.problem import window_solvers
 from mapctl.problem.density_selection import DensityEnsemble
+from mapctl.problem.receding_horizon import HorizonSettings
 from mapctl.problem.unknowns import WindowContext
 from mapctl.problem.window_solvers import PoseOffsets
 from mapctl.recording import Capture
@@ -26,6 +27,10 @@ from mapctl.terms import Clearance
 
 TOE = CANONICAL.indices(TOES)
 QUICK = RefinementSettings(lbfgs=LbfgsSettings(max_iterations=20), budget=Budget(evaluations=20))
+
+
+def windows(frames, overlap):
+    return HorizonSettings(frames, overlap, beyond_end=False)
 
 
 def standing_still(frames=60, *, drift=0.0):
@@ -95,7 +100,7 @@ def test_what_was_not_seen_moves_before_what_was():
 
 def test_a_density_counts_less_in_windows_that_are_out_of_its_depth():
     """The windows say so, and the energy is divided by what is lost."""
-    motion, settings = walk(50), replace(QUICK, frames=30, ahead=10, budget=Budget(evaluations=2))
+    motion, settings = walk(50), replace(QUICK, window=windows(30, 10), budget=Budget(evaluations=2))
     deep = tiny_density()
     shallow = replace(deep, card=replace(deep.card, quality={"windows": {"p2": 1e5}}))
     found = {}
@@ -115,7 +120,7 @@ def test_a_density_counts_less_in_windows_that_are_out_of_its_depth():
 def test_every_frame_comes_back_once_whatever_the_windows(monkeypatch):
     motion = walk(70, turn_rate=0.6)
     for frames, ahead in ((96, 24), (70, 8), (20, 8), (33, 1)):
-        settings = replace(QUICK, frames=frames, ahead=ahead, budget=Budget(evaluations=2))
+        settings = replace(QUICK, window=windows(frames, ahead), budget=Budget(evaluations=2))
         stood = refine(motion, odds(motion, -5.0, -5.0), capture_of(motion), settings)
         assert stood.motion.num_frames == len(stood.contacts) == 70
         assert (stood.motion.joint_positions() - motion.joint_positions()).norm(dim=-1).max() < 0.03
@@ -125,7 +130,7 @@ def test_every_frame_comes_back_once_whatever_the_windows(monkeypatch):
 def test_windows_meet_without_a_jump():
     """A slide that many windows work on: the hips' accelerations where two meet are as elsewhere."""
     motion = standing_still(120, drift=0.2)
-    settings = replace(QUICK, frames=40, ahead=16)
+    settings = replace(QUICK, window=windows(40, 16))
     out = refine(motion, odds(motion), capture_of(motion), settings).motion
     jump = torch.diff(out.joint_positions(), n=2, dim=0).norm(dim=-1).amax(dim=-1)
     seams = torch.zeros(len(jump), dtype=torch.bool)
@@ -145,7 +150,7 @@ def test_a_window_without_a_finite_solution_is_left_as_proposed(monkeypatch):
         return replace(result, x=torch.full_like(result.x, math.nan), energy=torch.full_like(result.energy, math.nan))
 
     monkeypatch.setattr(window_solvers, "minimise", lost)
-    stood = refine(motion, odds(motion), capture_of(motion), replace(QUICK, frames=30, ahead=10))
+    stood = refine(motion, odds(motion), capture_of(motion), replace(QUICK, window=windows(30, 10)))
     assert stood.motion.num_frames == 50
     assert (stood.motion.joint_positions() - motion.joint_positions()).norm(dim=-1).max() < 1e-4
 

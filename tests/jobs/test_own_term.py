@@ -7,14 +7,13 @@ import torch
 from captures import noisy, on_rig
 from helpers import generator, walk
 from linear_inbetweener import LinearInbetweener
-from methods import UNFINISHED
 from tiny_denoiser import tiny_denoiser
 from toy_density import toy_density
 
 from controllers.denoising.denoise import denoise
 from controllers.generation.generate import GenerateSettings, generate
 from controllers.inbetweening.blend import LimbTransfer, blend
-from controllers.inbetweening.infill import ChainSettings, chain, infill
+from controllers.inbetweening.infill import chain, infill
 from controllers.inbetweening.tween import tween
 from controllers.shots.shot import follow
 from controllers.steering import steer
@@ -78,11 +77,7 @@ JOBS = {
         WALKER, walk(30), LimbTransfer(("leftHand",), 0, 5, 22, margin=0.4), LinearInbetweener(), terms=terms
     ),
     "chain": lambda terms: chain(
-        [WALKER, WALKER],
-        LinearInbetweener(),
-        settings=ChainSettings(piece=12, gap=(12, 12)),
-        generator=generator(),
-        terms=terms,
+        [WALKER, WALKER], LinearInbetweener(), piece=12, gap=(12, 12), generator=generator(), terms=terms
     ),
 }
 
@@ -124,7 +119,7 @@ def test_terms_see_a_character_at_its_own_size():
 
 def test_terms_without_a_map_stage_to_join_are_refused():
     with pytest.raises(RequestError, match="terms belong to the MAP stage"):
-        tween(WALKER, Keys((0, 39)), LinearInbetweener(), settings=UNFINISHED, terms=[HandHeight(1.0)])
+        tween(WALKER, Keys((0, 39)), LinearInbetweener(), refinement=None, terms=[HandHeight(1.0)])
     with pytest.raises(RequestError, match="terms belong to the foot clean-up"):
         generate(
             TOY, seconds=1, generator=generator(), settings=GenerateSettings(foot_cleanup=None), terms=[HandHeight(1.0)]

@@ -10,8 +10,7 @@ from toy_density import toy_density
 
 from controllers.common.map_refinement import RefinementSettings
 from controllers.denoising.denoise import DenoiseSettings, denoise
-from controllers.inbetweening.pipeline import InfillSettings
-from controllers.inbetweening.proposers import AutoInbetweener, RolloutInbetweener, RolloutSettings
+from controllers.inbetweening.proposers import AutoInbetweener, RolloutInbetweener
 from controllers.inbetweening.tween import tween
 from controllers.shots.shot import follow
 from controllers.shots.walk import FollowSettings
@@ -27,7 +26,6 @@ from mapctl.solver.lbfgs import LbfgsSettings
 TOY = toy_density()
 WINDOW = HorizonSettings(frames=12, overlap=6)
 REFINEMENT = RefinementSettings(lbfgs=LbfgsSettings(max_iterations=4), budget=Budget(evaluations=4))
-FILLING = InfillSettings(refinement=REFINEMENT)
 
 
 def check(motion, frames):
@@ -73,9 +71,8 @@ def test_it_is_a_prior_of_tweening_and_proposes_rollouts():
     motion, keys = on_rig("bandai", 40), Keys((0, 20, 39))
     infiller = tiny_infiller(drawn=0.02)
     quick = LatentNoiseSolver(rounds=1, lbfgs=LbfgsSettings(max_iterations=6), budget=Budget(evaluations=20))
-    rolling = RolloutSettings(ahead=4, method=quick)
-    for inbetweener in (AutoInbetweener(infiller, [TOY]), RolloutInbetweener([TOY], infiller, rolling)):
-        done = tween(motion, keys, inbetweener, settings=FILLING, densities=[TOY])
+    for inbetweener in (AutoInbetweener(infiller, [TOY]), RolloutInbetweener([TOY], infiller, ahead=4, solver=quick)):
+        done = tween(motion, keys, inbetweener, refinement=REFINEMENT, densities=[TOY])
         check(done.motion, 40)
         torch.testing.assert_close(done.motion.local_quat_xyzw[[0, 20, 39]], motion.local_quat_xyzw[[0, 20, 39]])
     assert {source.by for source in done.sources} == {"rollout of toy"}

@@ -9,7 +9,7 @@ from helpers import walk
 from scipy.optimize import least_squares
 from tiny_stitcher import tiny_stitcher
 
-from controllers.inbetweening.pipeline import CanonicalClip, InfillSettings
+from controllers.inbetweening.pipeline import CanonicalClip
 from controllers.inbetweening.proposers import SlerpInbetweener, StitchedInbetweener
 from controllers.inbetweening.tween import tween
 from mapctl.inbetweening.effector_targets import EffectorTargets
@@ -85,9 +85,6 @@ def test_an_answer_that_is_not_finite_is_left_to_another():
     assert (source.by, source.reason) == ("interpolation", "nothing finite came of it")
 
 
-RAW = InfillSettings(refine=False)
-
-
 def never():
     raise AssertionError("nothing was left to the other")
 
@@ -110,7 +107,7 @@ def test_gaps_that_are_too_long_or_have_one_end_are_the_others_and_the_rest_stay
 
 
 def test_what_was_stitched_is_reported():
-    done = tween(walk(60), Keys.of([0, 20, 59]), stitched(SlerpInbetweener), settings=RAW)
+    done = tween(walk(60), Keys.of([0, 20, 59]), stitched(SlerpInbetweener), refinement=None)
     given = done.details()
     assert 0 <= given["sides_apart_cm"] < 100
     assert [(row["by"], row["start"], row["stop"]) for row in given["fallback"]] == [("slerp", 21, 59)]

@@ -1,7 +1,6 @@
 """L-BFGS beside scipy's, the swarm and samples, and their budgets."""
 
 import math
-from functools import partial
 from itertools import accumulate
 
 import numpy as np
@@ -11,7 +10,7 @@ import torch
 
 from mapctl.solver.budget import Budget, Meter
 from mapctl.solver.lbfgs import LbfgsSettings, LbfgsStatus, differentiate, minimise
-from mapctl.solver.swarm import SwarmSettings, run_best_of_samples, run_swarm
+from mapctl.solver.swarm import SwarmSettings, run_swarm
 
 TIGHT = LbfgsSettings(max_iterations=1000, gradient_tolerance=1e-9, relative_energy_tolerance=1e-15)
 SCALE = torch.logspace(0, 4, 50, dtype=torch.float64)
@@ -138,9 +137,9 @@ def test_evaluations_of_every_search_are_kept_to(limit):
     result = minimise(function, rows(-1.2, 1.0), meter=meter)
     assert len(energies) == meter.evaluations == limit
     assert result.status == (LbfgsStatus.OUT_OF_BUDGET,)
-    for search in (run_swarm, partial(run_best_of_samples, count=9)):
+    for settings in (SwarmSettings(), SwarmSettings(particles=9, iterations=1)):
         meter = Meter(Budget(evaluations=limit))
-        found = search(sphere, start=torch.ones(3), spread=1.0, meter=meter, generator=seeded())
+        found = run_swarm(sphere, start=torch.ones(3), spread=1.0, settings=settings, meter=meter, generator=seeded())
         assert found.evaluations == meter.evaluations <= limit
         assert found.energy <= (math.inf if limit == 0 else 3.0)
 
@@ -158,15 +157,15 @@ def test_a_deadline_is_checked_before_every_evaluation():
     assert meter.exhausted
 
 
-def test_an_evaluation_that_would_end_too_late_is_not_begun_but_for_the_least():
+def test_an_evaluation_that_would_end_too_late_is_not_begun():
     now = [0.0]
     meter = Meter(Budget(seconds=1.0, evaluation_seconds=0.3), clock=lambda: now[0])
     assert not meter.take(4)
     assert meter.take(2)
     now[0] = 0.8
     assert not meter.take(), "0.4 s each by now"
-    late = Meter(Budget(evaluations=5, seconds=0.0, least=3), clock=lambda: now[0])
-    assert [late.take() for _ in range(4)] == [True] * 3 + [False]
+    late = Meter(Budget(evaluations=5, seconds=0.0), clock=lambda: now[0])
+    assert not late.take()
     assert late.remaining == 0
     assert Budget(seconds=2.0).within(1.0).seconds == 1.0
 
@@ -189,8 +188,9 @@ def test_a_swarm_descends_and_beats_samples_on_many_basins():
     assert run_swarm(sphere, start=start, spread=1.0, settings=settings, generator=seeded()).energy < 1e-2
     flown, drawn = [], []
     for seed in range(3):
-        flown.append(run_swarm(rastrigin, start=start, spread=1.5, settings=settings, generator=seeded(seed)).energy)
-        drawn.append(run_best_of_samples(rastrigin, start=start, spread=1.5, count=1200, generator=seeded(seed)).energy)
+        for energies, each in ((flown, settings), (drawn, SwarmSettings(particles=1200, iterations=1))):
+            found = run_swarm(rastrigin, start=start, spread=1.5, settings=each, generator=seeded(seed))
+            energies.append(found.energy)
     assert np.mean(flown) < np.mean(drawn)
 
 

@@ -24,7 +24,7 @@ AHEAD = 0.7
 
 @pytest.fixture(scope="module")
 def stand(tmp_path_factory):
-    """The stand of a density whose mean pose is that of walks."""
+    """The stand of the mean pose of walks."""
     prior = priors.load(str(save_tiny_prior(tmp_path_factory.mktemp("prior") / "p.safetensors")))
     return find_stand(prior.feature_mean, HERE, CANONICAL, TOE_REST_HEIGHT)
 

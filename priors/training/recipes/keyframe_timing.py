@@ -25,7 +25,6 @@ class KeyframeTimingSettings(Settings):
 
     kind = "keyframe-timing"
     used_by = "use it with mapctl tween --suggest-timing --timing"
-    uses_gpu = False
 
     steps: Count = 15
     """Reweightings of the least squares."""

@@ -14,7 +14,7 @@ from typing import Annotated
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, distributed, nn
+from torch import Tensor, nn
 from torch.nn.functional import one_hot
 from tyro.conf import arg
 
@@ -48,7 +48,6 @@ from priors.training.loop import (
     NetworkSettings,
     Number,
     Row,
-    count_processes,
     make_generator,
     update_average,
     use_device,
@@ -167,8 +166,6 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         self.average = self.network
         """Moving average of the weights since the critic joined, the weights themselves without one."""
         if settings.critic_steps:
-            if count_processes()[1] > 1:
-                raise RequestError("a density is trained with a critic by one process")
             self.critic_trainer = CriticTrainer(self.windows, seed=settings.seed)
             self.average = copy.deepcopy(self.network).requires_grad_(False)
 
@@ -307,12 +304,9 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
             self._add_gradient(critic_trainer.score(generated, self.generator))
 
     def _add_gradient(self, loss: Tensor, *, retain_graph: bool = False) -> None:
-        parameters, processes = [p for p in self.network.parameters() if p.requires_grad], count_processes()[1]
+        parameters = [p for p in self.network.parameters() if p.requires_grad]
         found = torch.autograd.grad(loss, parameters, retain_graph=retain_graph, allow_unused=True)
         used = [(p, g.contiguous()) for p, g in zip(parameters, found, strict=True) if g is not None]
-        if processes > 1:
-            for _, gradient in used:
-                distributed.all_reduce(gradient.div_(processes))
         norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(g) for _, g in used]))
         if bool(torch.isfinite(norm)):  # a free run that left the data's range carries no information
             share = _GRADIENT_CLIP / norm.clamp(min=_GRADIENT_CLIP)

@@ -74,7 +74,6 @@ class RefinerSettings(Settings):
     kind = "refiner"
     used_by = "use it with --refiner"
     keeps_best = True
-    uses_gpu = False
 
     match: Pattern = None
     """Only clips whose path below the data folder holds this regular expression; by default the clips that the density
