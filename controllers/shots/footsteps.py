@@ -235,15 +235,14 @@ def _lay_side_steps(displacement: Displacement, first: int, frames: int) -> list
 
 def _measure_strain(displacement: Displacement, plan: Sequence[Footstep]) -> float:
     """Measure the largest distance between feet that stand, metres, and by how much they cross."""
-    held, most = [0.0, 0.0], 0.0
-    for step in plan:
-        held[step.foot] = step.share
-        left, right = (displacement.toes_at(foot, torch.tensor([held[foot]], dtype=torch.float64)) for foot in range(2))
-        apart = (left[0] - right[0])[:, ::2]
-        heading = displacement.hips_at(torch.tensor([held[1 - step.foot]], dtype=torch.float64))[:, 2]
-        aside = float(rotations.rotate_ground(apart, -heading)[0, 0])
-        most = max(most, float(apart.norm()) + 4 * max(0.0, _NARROWEST - aside))
-    return most
+    held = torch.zeros(len(plan), 2, dtype=torch.float64)
+    for number, step in enumerate(plan):
+        held[number:, step.foot] = step.share
+    left, right = (displacement.toes_at(foot, held[:, foot])[0] for foot in range(2))
+    other = held[range(len(plan)), [1 - step.foot for step in plan]]
+    apart = (left - right)[:, ::2]
+    aside = rotations.rotate_ground(apart, -displacement.hips_at(other)[:, 2])[:, 0]
+    return float((apart.norm(dim=-1) + 4 * (_NARROWEST - aside).clamp_min(0)).max())
 
 
 _CLEARANCE = 0.035  # metres of the toe in mid-swing over its rest height, as of walking people (see terms.Clearance)

@@ -338,6 +338,8 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
         return _stand_still(replace(state, stand=stand), asked, began)
     if steps is not None and steps is not state.steps:
         state = replace(state, target=_start_target(state, command))
+    elif steps is None and needs_steps(command, float(state.committed.ground_pose.heading)):
+        command = replace(command, speed=0.0, heading=command.hips_heading)  # it comes to rest first
     state = replace(state, steps=steps, stand=None)
     stuck = steps is None and _velocity_error(state) > settings.stuck
     if stuck:
@@ -487,7 +489,8 @@ def _find_steps(state: SteerState, command: Command) -> PlannedSteps | None:
     if state.steps is not None and state.steps.obey(command):
         return state.steps
     heading = float(state.committed.ground_pose.heading)
-    if not _is_at_rest(state) or not (command.speed == 0 or needs_steps(command, heading)):
+    taken = state.steps is not None and not len(state.steps.features)  # its last pose is a stand
+    if not (taken or _is_at_rest(state)) or not (command.speed == 0 or needs_steps(command, heading)):
         return None
     came_to_stand = state.stand is not None or (state.steps is not None and state.steps.command.speed == 0)
     if came_to_stand and not needs_steps(command, heading):

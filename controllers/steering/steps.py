@@ -31,7 +31,7 @@ from mapctl.numerics.easing import smootherstep
 from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL, FEET, TOES, Skeleton
 
-PLANNED_FRAMES = 300
+PLANNED_FRAMES = 150
 """Frames of travel that are planned at once, at PRIOR_FPS."""
 _STEP_FRAMES = 11  # of a step of a turn on the spot, or into a stand
 _OFF_FACING = math.radians(35)  # between travel and facing, from which on travel is no walk
