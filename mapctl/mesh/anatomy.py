@@ -7,6 +7,7 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
+import torch
 
 from mapctl import rotations
 from mapctl.errors import RequestError
@@ -175,7 +176,8 @@ class Anatomy:
         """Return the mean (3, 3) of a joint's rotations (frames, 3, 3) with its bone in the bind pose's direction."""
         bone, direction = self._bones.get(joint, (np.zeros(3), _UP))
         if np.linalg.norm(bone) > 1e-3 * self.scale:
-            turns = _shortest_arcs(unit(turns @ bone), direction) @ turns
+            along, straight = (torch.from_numpy(v) for v in (turns @ bone, np.tile(direction, (len(turns), 1))))
+            turns = rotations.to_matrix(rotations.between_vectors(along, straight)).numpy() @ turns
         u, _, vt = np.linalg.svd(turns.mean(axis=0))
         return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
 
@@ -280,12 +282,3 @@ def _add_tips(motion: Motion, joints: Array, turns: Array, scale: float) -> Poin
             extra.append((joint, joints[:, joint] + along * _TIP_LENGTHS[part] * scale))
     world = np.concatenate([joints, *(position[:, None] for _, position in extra)], axis=1)
     return Points((*parents, *(j for j, _ in extra)), (*found, *(found[j] for j, _ in extra)), world)
-
-
-def _shortest_arcs(along: Array, target: Array) -> Array:
-    """Return the rotations (n, 3, 3) that turn unit vectors (n, 3) to a target (3,) by the shortest way."""
-    axis, cosine = np.cross(along, target), along @ target
-    skew = np.zeros((len(along), 3, 3))
-    skew[:, [2, 0, 1], [1, 2, 0]] = axis
-    skew[:, [1, 2, 0], [2, 0, 1]] = -axis
-    return np.eye(3) + skew + skew @ skew / np.maximum(1 + cosine, 1e-6)[:, None, None]

@@ -91,7 +91,7 @@ _SHOE = [  # from the heel to the ball, along the sole
 ]
 _TOE = [(0.0, 0.046, 0.034, 0, 0), (0.5, 0.043, 0.028, 0, 0.004), (1.0, 0.034, 0.020, 0, 0.010)]
 _GRID = (0.023, 0.011)  # metres between the lines of the grid, and where hands, feet and head are
-_SMOOTHINGS = 28  # of the joints' shares over the mesh, each over a triangle's edge
+_SMOOTHINGS, _LEAST_SHARE = 16, 0.05  # of the joints' shares over the mesh, each over a triangle's edge
 _CARRIERS = 4  # joints a vertex, which is what viewers of glTF take
 _SKIN, _HAIR, _TROUSERS = (colours.rgb(code) for code in (colours.SKIN, colours.HAIR, colours.TROUSERS))
 _SIDES = {Side.LEFT: (1.0, colours.rgb(colours.LEFT)), Side.RIGHT: (-1.0, colours.rgb(colours.RIGHT))}
@@ -355,6 +355,7 @@ def _smooth_shares(joint: Array, faces: Array, count: int) -> tuple[Array, Array
         shares = near @ shares
     carriers = np.argsort(-shares, axis=1, kind="stable")[:, :_CARRIERS]
     weights = np.take_along_axis(shares, carriers, axis=1)
+    weights[weights < _LEAST_SHARE] = 0.0
     return carriers, weights / weights.sum(axis=1, keepdims=True)
 
 
