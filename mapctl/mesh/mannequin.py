@@ -196,9 +196,12 @@ class _Builder:
         """Return vertices (n, 3), those near a border moved onto it, and the faces' colours (m, 3)."""
         piece, vertices = nearest[faces[:, 0]], vertices.copy()
         rgb = np.array([one.rgb for one in self.pieces])[piece]
+        edges = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
         for border in self.borders:
             height = (vertices - border.point) @ border.normal
-            close = (np.abs(height) < 0.55 * _GRID[0] * self.low) & np.isin(nearest, list(border.pieces))
+            crossing = edges[height[edges[:, 0]] * height[edges[:, 1]] < 0]
+            nearer = crossing[np.arange(len(crossing)), np.abs(height[crossing]).argmin(axis=1)]
+            close = np.unique(nearer[np.isin(nearest[nearer], list(border.pieces))])
             vertices[close] -= height[close, None] * border.normal
             beyond = (vertices[faces].mean(axis=1) - border.point) @ border.normal > 1e-4 * self.low
             rgb[beyond & (rgb == border.old).all(axis=1) & np.isin(piece, list(border.pieces))] = border.new
@@ -248,7 +251,7 @@ class _Builder:
     def _dress(self, top: int) -> None:
         """Draw the collar, and where hair begins."""
         every, head = range(len(self.pieces)), self.anatomy.find(Part.HEAD)
-        collar = self.place[top] + np.array([0.0, 0.026, 0.0]) * self.high
+        collar = self.place[top] + np.array([0.0, 0.036, 0.0]) * self.high
         self._split(every, collar, np.array([0.0, 1.0, 0.3]), self.colour, _SKIN)
         if head is not None:
             line = self.place[head] + np.array([0.0, 0.085, 0.0]) * self.high
