@@ -96,7 +96,7 @@ def mesh_union(solids: Sequence[Solid], lines: Sequence[Array], scale: float) ->
         total[part] += values.reshape(block.shape[:3])
     field = -soft * np.log(np.maximum(total, np.exp(-_REACH)))
     vertices, faces = _mesh_zero_set(field, lines)
-    slope = scipy.interpolate.RegularGridInterpolator(lines, np.stack(np.gradient(field, *lines), axis=-1))
+    slope = scipy.interpolate.RegularGridInterpolator(lines, np.moveaxis(np.array(np.gradient(field, *lines)), 0, -1))
     for _ in range(2):  # onto the surface, by Newton's method along the slope
         gradient = slope(vertices)
         distance = -soft * np.log(sum(np.exp(np.clip(-s.distance(vertices) / soft, -_FAR, _FAR)) for s in solids))

@@ -195,7 +195,7 @@ class Driving:
         """Return what a page asks for; None where it asks for nothing."""
         run_speed = max(self.walk_speed, 0.75 * self.fastest)
         direction, speed = find_direction(page.keys), run_speed if page.keys & FAST else self.walk_speed
-        if (pushed := _push(page.stick)) is not None:
+        if page.stick is not None and (pushed := _push(page.stick)) is not None:
             direction, push = pushed
             top = self.walk_speed + (run_speed - self.walk_speed) * max(0.0, page.stick[2])
             speed = round(max(0.3, top * push), 2)
@@ -222,7 +222,7 @@ def _push(stick: tuple[float, ...] | None) -> tuple[tuple[float, float], float] 
 def _differ(one: Steering, other: Steering) -> bool:
     """Return whether two requests differ by more than the camera's sway."""
     turned = [
-        (a is None) != (b is None) or (a is not None and abs(math.remainder(a - b, 360)) >= _LEAST_TURN)
+        a is not b if a is None or b is None else abs(math.remainder(a - b, 360)) >= _LEAST_TURN
         for a, b in zip(one[1:], other[1:], strict=True)
     ]
     return any(turned) or abs(one[0] - other[0]) >= _LEAST_SPEED

@@ -114,17 +114,17 @@
       #mapctl-touch { display: contents; font: 13px system-ui, sans-serif; color: #39424e; }
       #mapctl-touch > * { position: fixed; z-index: 5; touch-action: none; user-select: none; color: inherit;
         background: rgba(255, 255, 255, 0.6); border: 1px solid rgba(90, 100, 115, 0.35); }
-      #mapctl-touch > div { bottom: 84px; width: 116px; height: 116px; border-radius: 50%; text-align: center;
+      #mapctl-touch > div { bottom: 68px; width: 116px; height: 116px; border-radius: 50%; text-align: center;
         line-height: 24px; }
       #mapctl-touch i { position: absolute; left: 35px; top: 35px; width: 44px; height: 44px; border-radius: 50%;
         background: rgba(38, 98, 184, 0.75); pointer-events: none; }
       #mapctl-move { left: 20px; }
       #mapctl-aim { right: 20px; }
-      #mapctl-touch > button { bottom: 212px; width: 64px; height: 44px; border-radius: 10px; }
+      #mapctl-touch > button { left: calc(50% - 34px); width: 68px; height: 36px; border-radius: 10px; }
       #mapctl-touch > button[aria-pressed=true] { background: rgba(38, 98, 184, 0.75); color: white; }
-      #mapctl-run { left: 20px; }
-      #mapctl-stop { left: calc(50% - 32px); }
-      #mapctl-lock { right: 20px; }
+      #mapctl-run { bottom: 148px; }
+      #mapctl-stop { bottom: 108px; }
+      #mapctl-lock { bottom: 68px; }
     }`;
   document.head.append(style);
   document.addEventListener("DOMContentLoaded", () => document.body.append(list, touch));
