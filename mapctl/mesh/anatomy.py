@@ -119,9 +119,7 @@ class Anatomy:
             for side, mirror in ((Side.LEFT, 1.0), (Side.RIGHT, -1.0)):
                 lower, end = self.find(parts[1], side), self.find(parts[2], side)
                 end = next(self.children(lower), None) if end is None and lower is not None else end
-                chain = [] if end is None else [end]
-                while chain and self.points.parents[chain[-1]] > self.hips:
-                    chain.append(self.points.parents[chain[-1]])
+                chain = [] if end is None else self.find_path(end)
                 named = {self.points.roles[joint].part: k for k, joint in enumerate(chain)}
                 last = named.get(parts[0], 2)
                 if 2 <= last < len(chain):
@@ -156,12 +154,16 @@ class Anatomy:
         flat |= {foot.ball: foot.toe_axes.T for foot in self.feet if foot.ball < self.joints}
         bind, place = np.tile(np.eye(3), (self.joints, 1, 1)), np.zeros((len(points.parents), 3))
         bind[self.hips] = self._pelvis_axes.T
+        done = self.find_path(self.hips)  # what is above the hips moves with them
+        for joint in done[1:]:
+            turned = bind[self.hips] @ np.swapaxes(some[:, self.hips], 1, 2) @ some[:, joint]
+            bind[joint] = _average_rotations(turned)
         for point, parent in enumerate(points.parents):
-            if parent < self.hips:
+            if parent < 0:
                 continue
             offset = points.world[0, point] - points.world[0, parent]
             place[point] = place[parent] + bind[parent] @ self.rotations[0, parent].T @ offset
-            if point >= self.joints:
+            if point >= self.joints or point in done:
                 continue
             part = points.roles[point].part
             if point in flat:
@@ -170,7 +172,14 @@ class Anatomy:
                 bind[point] = bind[parent]
             else:
                 bind[point] = self._average(point, bind[parent] @ np.swapaxes(some[:, parent], 1, 2) @ some[:, point])
-        return place, bind
+        return place - place[self.hips], bind
+
+    def find_path(self, joint: int) -> list[int]:
+        """Return a joint and all above it."""
+        path = [joint]
+        while self.points.parents[path[-1]] >= 0:
+            path.append(self.points.parents[path[-1]])
+        return path
 
     def _average(self, joint: int, turns: Array) -> Array:
         """Return the mean (3, 3) of a joint's rotations (frames, 3, 3) with its bone in the bind pose's direction."""
@@ -178,8 +187,7 @@ class Anatomy:
         if np.linalg.norm(bone) > 1e-3 * self.scale:
             along, straight = (torch.from_numpy(v) for v in (turns @ bone, np.tile(direction, (len(turns), 1))))
             turns = rotations.to_matrix(rotations.between_vectors(along, straight)).numpy() @ turns
-        u, _, vt = np.linalg.svd(turns.mean(axis=0))
-        return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        return _average_rotations(turns)
 
     @cached_property
     def _bones(self) -> dict[int, tuple[Array, Array]]:
@@ -282,3 +290,9 @@ def _add_tips(motion: Motion, joints: Array, turns: Array, scale: float) -> Poin
             extra.append((joint, joints[:, joint] + along * _TIP_LENGTHS[part] * scale))
     world = np.concatenate([joints, *(position[:, None] for _, position in extra)], axis=1)
     return Points((*parents, *(j for j, _ in extra)), (*found, *(found[j] for j, _ in extra)), world)
+
+
+def _average_rotations(turns: Array) -> Array:
+    """Return the rotation (3, 3) nearest to the mean of rotations (n, 3, 3)."""
+    u, _, vt = np.linalg.svd(turns.mean(axis=0))
+    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt

@@ -81,8 +81,6 @@ _HEAD = (  # centre ahead of and above the head joint, and half axes to the left
     ((0.078, 0.088, -0.002), (0.008, 0.028, 0.016)),  # ears
     ((-0.078, 0.088, -0.002), (0.008, 0.028, 0.016)),
 )
-
-
 _SHOE = [  # from the heel to the ball, along the sole
     (0.0, 0.033, 0.042, 0, 0),
     (0.35, 0.035, 0.042, 0, 0),
@@ -91,6 +89,7 @@ _SHOE = [  # from the heel to the ball, along the sole
 ]
 _TOE = [(0.0, 0.046, 0.034, 0, 0), (0.5, 0.043, 0.028, 0, 0.004), (1.0, 0.034, 0.020, 0, 0.010)]
 _GRID = (0.023, 0.011)  # metres between the lines of the grid, and where hands, feet and head are
+_MOST_LINES = 120  # of the coarse grid along an axis, whatever the proportions
 _SMOOTHINGS, _LEAST_SHARE = 16, 0.05  # of the joints' shares over the mesh, each over a triangle's edge
 _CARRIERS = 4  # joints a vertex, which is what viewers of glTF take
 _SKIN, _HAIR, _TROUSERS = (colours.rgb(code) for code in (colours.SKIN, colours.HAIR, colours.TROUSERS))
@@ -237,9 +236,8 @@ class _Builder:
 
     def _add_trunk(self, top: int, legs: Sequence[Limb]) -> None:
         place, base = self.place, self.place[[leg.joints[0] for leg in legs]].mean(axis=0)
-        chain = [top]
-        while chain[-1] > self.anatomy.hips:
-            chain.append(self.anatomy.points.parents[chain[-1]])
+        chain, hips = self.anatomy.find_path(top), self.anatomy.hips
+        chain = chain[: chain.index(hips) + 1] if hips in chain else chain
         along = place[top] - base
         shares = [(float((place[j] - base) @ along / (along @ along)), j) for j in reversed(chain)]
         trunk = self._add(shares, base, place[top], _TRUNK, self.high, _X, self.colour)
@@ -324,9 +322,10 @@ class _Builder:
 
     def _add_bones(self) -> None:
         """Add thin capsules for all bones, of a rig that is not recognised as a person's."""
-        hips, parents = self.anatomy.hips, self.anatomy.points.parents
+        hips, parents, extent = self.anatomy.hips, self.anatomy.points.parents, np.ptp(self.place, axis=0).max()
+        self.low = extent / 1.7 if extent > 0 else self.low
         for point, parent in [(k, p) for k, p in enumerate(parents) if p >= hips] or [(hips, hips)]:
-            self._add_capsule(parent, point, 0.02, self.colour)
+            self._add_capsule(parent, point, 0.02 if extent > 0 else 0.09, self.colour)
 
     def _add_capsule(self, joint: int, point: int, radius: float, rgb: Array) -> None:
         rows = [(0, radius, radius, 0, 0), (1, radius, radius, 0, 0)]
@@ -334,8 +333,9 @@ class _Builder:
 
     def _lay_grid(self) -> list[Array]:
         """Return the grid's lines along x, y and z: finer where hands, feet and head are."""
-        coarse, fine = (step * self.low for step in _GRID)
         low, high = (np.array(corner) for corner in zip(*(piece.solid.bounds for piece in self.pieces), strict=True))
+        extent = (high.max(axis=0) - low.min(axis=0)).max()
+        coarse, fine = (step * max(self.low, extent / _MOST_LINES / _GRID[0]) for step in _GRID)
         parts = [self.anatomy.points.roles[piece.joints[0][1]].part for piece in self.pieces]
         small = np.array([part in (Part.HAND, Part.FINGER, Part.HEAD, Part.TOES, Part.FOOT) for part in parts])
         lines = []
