@@ -8,8 +8,9 @@ from os import PathLike, fspath
 
 from mapctl import formats
 from mapctl.errors import RequestError
+from mapctl.mesh.anatomy import Anatomy
 from mapctl.mesh.character_mesh import CharacterMesh
-from mapctl.mesh.mannequin import Mannequin, SkinnedBody
+from mapctl.mesh.mannequin import Body
 from mapctl.mesh.primitives import Array
 from mapctl.motion import Motion
 from mapctl.retarget import as_rig, from_canonical, put_upright, to_canonical
@@ -34,11 +35,11 @@ class DrawnMotion:
     put_on: Callable[[Motion], "DrawnMotion"]
     """Puts further frames of the same source on the character, as poses that are requested."""
 
-    def build_body(self, fps: Fraction, colour: Array) -> SkinnedBody:
+    def build_body(self, fps: Fraction, colour: Array) -> Body:
         """Build the body at a film's rate; `colour` is that of its bones (red, green, blue, 0 to 1), where these are
         drawn."""
         bones = replace(self.bones, source=None).resample(fps)
-        return SkinnedBody(self.mesh, self.motion.resample(fps), Mannequin(bones, colour))
+        return Body(self.motion.resample(fps), self.mesh, Anatomy(bones), colour)
 
 
 @dataclass(frozen=True, eq=False)

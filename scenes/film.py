@@ -182,7 +182,7 @@ def _add_label(picture: Array, text: str) -> Array:
     image = Image.fromarray(picture)
     height = max(9, round(picture.shape[0] * 0.07))
     draw = ImageDraw.Draw(image)
-    draw.text((height * 0.6, height * 0.4), text, fill=colours.VISOR, font=ImageFont.load_default(size=height))
+    draw.text((height * 0.6, height * 0.4), text, fill=colours.INK, font=ImageFont.load_default(size=height))
     return np.asarray(image)
 
 

@@ -90,8 +90,7 @@ _GAMMA = 2.2
 class Layer(Enum):
     """How triangles cover what is behind them."""
 
-    CLOSED = "solids, from outside"
-    OPEN = "from both sides"
+    SOLID = "opaque, from both sides"
     SHEER = "seen through, in the order of the faces"
 
 
@@ -106,7 +105,7 @@ def list_layers(ground: Sequence[Surface], bodies: Sequence[Surface], eye: Array
         # Vertices of opaque triangles have no opacity, by which a mesh as a whole would count as seen through.
         solid = replace(body, rgba=np.column_stack([body.rgba[:, :3], np.ones(len(body.rgba))]))
         is_sheer = (body.rgba[body.faces, 3] < _OPAQUE).any(axis=1)
-        layers[Layer.OPEN if body.is_open else Layer.CLOSED].append(replace(solid, faces=body.faces[~is_sheer]))
+        layers[Layer.SOLID].append(replace(solid, faces=body.faces[~is_sheer]))
         if is_sheer.any():
             faces = body.faces[is_sheer]
             away = np.linalg.norm(body.vertices[faces].mean(axis=1) - eye, axis=1)
@@ -152,11 +151,7 @@ class OffscreenPainter:
         gl = self._gl
         self._scene = gl.Scene(bg_color=[*colours.rgb(colours.BACKGROUND), 1.0])
         self._camera = self._scene.add(gl.PerspectiveCamera(yfov=1.0, znear=_CLIP_NEAR, zfar=_CLIP_FAR))
-        looks = {
-            Layer.CLOSED: {},
-            Layer.OPEN: {"doubleSided": True},
-            Layer.SHEER: {"doubleSided": True, "alphaMode": "BLEND"},
-        }
+        looks = {Layer.SOLID: {"doubleSided": True}, Layer.SHEER: {"doubleSided": True, "alphaMode": "BLEND"}}
         self._looks = {
             layer: gl.MetallicRoughnessMaterial(baseColorFactor=[1.0] * 4, **look) for layer, look in looks.items()
         }

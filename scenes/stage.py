@@ -14,7 +14,7 @@ from mapctl.curves import Curve
 from mapctl.errors import RequestError
 from mapctl.joint_names import Side
 from mapctl.mesh import colours
-from mapctl.mesh.mannequin import Body, Mannequin
+from mapctl.mesh.mannequin import Body
 from mapctl.mesh.primitives import Array, Surface, merge_surfaces
 from mapctl.motion import Motion
 from scenes import overlays
@@ -156,7 +156,7 @@ def _prepare_actor(shot: Shot, number: int, count: int, fps: Fraction) -> Staged
         raise RequestError(f"start_seconds must be from 0 to 3600, got {shot.start_seconds:g}")
     colour = colours.rgb(shot.colour or colours.default_colour(number))
     motion = shot.motion.resample(fps)
-    body = Mannequin(motion, colour) if shot.drawn is None else shot.drawn.build_body(fps, colour)
+    body = Body.of(motion, colour) if shot.drawn is None else shot.drawn.build_body(fps, colour)
     # One actor has a red curve and a yellow trail as in Wang et al. 2019; among several both have the actor's colour.
     target, trod = colours.rgb(colours.TARGET), colours.rgb(colours.TRAIL)
     if count > 1:
@@ -209,6 +209,6 @@ def _build_figures(poses: Sequence[Motion], motion: Motion, drawn: DrawnMotion |
         return [Figure(body, 0, _TINT, toward=colours.TARGET, shell=_SHELL) for body in bodies]
     # A body's shoes are as its whole motion shows them flat; a pose alone may stand on its toes.
     whole = reduce(lambda joined, pose: joined.join(replace(pose, fps=motion.fps)), poses, motion)
-    body = Mannequin(whole, colours.rgb(colours.TARGET))
+    body = Body.of(whole, colours.rgb(colours.TARGET))
     numbers = range(motion.num_frames, whole.num_frames)
     return [Figure(body, number, _TINT, toward=colours.TARGET, shell=_SHELL) for number in numbers]

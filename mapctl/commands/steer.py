@@ -201,7 +201,6 @@ def _run_steering(
 
 def _stream_to(stream: "PoseStream", clock: WallClock, frames: int, zero: float) -> Display:
     """Build the display that has a script's frames sent when they are due; `zero` is the clock's time at second 0."""
-    from mapctl.streaming.sender import guide
 
     def show(new: SteerFrames, due: float) -> None:
         left = frames - round(due * float(new.motion.fps))
@@ -209,7 +208,7 @@ def _stream_to(stream: "PoseStream", clock: WallClock, frames: int, zero: float)
             motion, trajectory = new.motion, new.trajectory.numpy()
             parts = motion.root_position, motion.local_quat_xyzw, new.contacts, new.root_velocity
             root, quats, contacts, velocity = (part[:left].numpy() for part in parts)
-            guidance = guide(root, quats, contacts, velocity, trajectory)
+            guidance = stream.guide(root, quats, contacts, velocity, trajectory)
             stream.put(0, clock.perf_counter_at(zero + due), due, root, quats, guidance)
 
     return show

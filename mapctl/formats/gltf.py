@@ -941,8 +941,9 @@ def _add_body(motion: Motion, tree: Json, arrays: _Arrays) -> None:
     attributes = {name: arrays.add(values, _ARRAY_BUFFER) for name, values in columns.items()}
     faces = arrays.add(body.faces.reshape(-1).astype(np.uint32), _ELEMENT_ARRAY_BUFFER)
     tree["meshes"] = [{"name": name, "primitives": [{"attributes": attributes, "indices": faces, "material": 0}]}]
-    inverse = np.tile(np.eye(4, dtype=np.float32), (joints, 1, 1))
-    inverse[:, 3, :3] = -body.rest  # column-major: the translation is the last row here
+    inverse = np.tile(np.eye(4, dtype=np.float32), (joints, 1, 1))  # column-major: a translation is the last row here
+    frames = np.tile(np.eye(3), (joints, 1, 1)) if body.frames is None else body.frames
+    inverse[:, :3, :3], inverse[:, 3, :3] = frames, -np.einsum("jba,jb->ja", frames, body.rest)
     binds = arrays.add(inverse.reshape(joints, 16))
     tree["skins"] = [{"joints": list(range(joints)), "skeleton": 0, "inverseBindMatrices": binds}]
     look = {"baseColorFactor": [1.0, 1.0, 1.0, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.8}

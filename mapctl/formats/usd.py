@@ -849,12 +849,14 @@ def _build_stage(motion: "Motion") -> Usd.Stage:
     skeleton.CreateJointNamesAttr(list(motion.skeleton.names))
     offsets = motion.skeleton.offsets.numpy().copy()
     offsets[0] = 0.0
-    for create, positions in (
-        (skeleton.CreateBindTransformsAttr, body.rest),
-        (skeleton.CreateRestTransformsAttr, offsets),
+    for create, positions, frames in (
+        (skeleton.CreateBindTransformsAttr, body.rest, body.frames),
+        (skeleton.CreateRestTransformsAttr, offsets, None),
     ):
         matrices = np.tile(np.eye(4), (len(positions), 1, 1))
         matrices[:, 3, :3] = positions  # USD's vectors are rows, so the translation is the last row
+        if frames is not None:
+            matrices[:, :3, :3] = np.swapaxes(frames, 1, 2)
         create(Vt.Matrix4dArray.FromNumpy(matrices))
 
     animation = UsdSkel.Animation.Define(stage, f"{_ROOT}/motion")

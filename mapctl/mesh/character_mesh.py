@@ -11,7 +11,7 @@ from mapctl.mesh.primitives import Array
 
 @dataclass(frozen=True, eq=False)
 class CharacterMesh:
-    """Triangles of a character in its rest pose, in which every joint frame is aligned with the world."""
+    """Triangles of a character in its rest pose, and the joints that carry them."""
 
     vertices: Array
     """(n, 3) in the rest pose, metres."""
@@ -27,16 +27,19 @@ class CharacterMesh:
     """(n, k) their shares; each vertex's add up to 1."""
     rest: Array
     """(joints, 3) positions of all joints in the rest pose, metres."""
+    frames: Array | None = None
+    """(joints, 3, 3) rotations of all joints in the rest pose; None where all are aligned with the world."""
 
     def pose(self, positions: Array, turns: Array) -> tuple[Array, Array]:
         """Return vertices (n, 3) and unit normals (n, 3) of one pose.
 
-        `positions` (joints, 3) are the joints' in the world, metres; `turns` (joints, 3, 3) their world rotations
-        against the rest pose, as those of a `Motion` that was read from a character's file.
+        `positions` (joints, 3) are the joints' in the world, metres; `turns` (joints, 3, 3) their world
+        rotations, as those of a `Motion` that was read from a character's file.
         """
         # In 32 bits, twice as fast, and still exact to a micrometre: for that the origin must be near the body.
         centre = positions[0]
         matrices = np.empty((len(turns), 3, 4), np.float32)
+        turns = turns if self.frames is None else turns @ np.swapaxes(self.frames, 1, 2)
         matrices[..., :3] = turns
         matrices[..., 3] = positions - centre - np.einsum("jab,jb->ja", turns, self.rest)
         blended = (self._shares @ matrices.reshape(-1, 12)).reshape(-1, 3, 4)
@@ -45,6 +48,11 @@ class CharacterMesh:
         normals = np.einsum("nab,nb->na", blended[..., :3], outward)
         lengths = np.sqrt(np.einsum("na,na->n", normals, normals))
         return vertices + centre, normals / np.maximum(lengths, 1e-12)[:, None]
+
+    def to_joints(self, points: Array, joints: Array) -> Array:
+        """Return points (n, 3) of the rest pose in the frames of joints (n,)."""
+        local = points - self.rest[joints]
+        return local if self.frames is None else np.einsum("nba,nb->na", self.frames[joints], local)
 
     @cached_property
     def _shares(self) -> "scipy.sparse.csr_array":

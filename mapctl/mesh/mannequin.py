@@ -1,329 +1,417 @@
-"""A mannequin for any skeleton: left limbs blue, right limbs orange, torso in the actor's colour."""
+"""A person for any skeleton: one skinned mesh around its bones, left sleeve and shoe blue, right ones orange."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
 
 import numpy as np
+import scipy
 import torch
 
 from mapctl import rotations
 from mapctl.errors import MapctlError
-from mapctl.joint_names import Part, Side
+from mapctl.joint_names import Part, Role, Side
 from mapctl.mesh import colours
-from mapctl.mesh.anatomy import Anatomy, Foot
+from mapctl.mesh.anatomy import Anatomy, Foot, Limb
 from mapctl.mesh.character_mesh import CharacterMesh
-from mapctl.mesh.primitives import Array, RoundedBoxes, Surface, frame_along
+from mapctl.mesh.isosurface import Solid, mesh_union
+from mapctl.mesh.primitives import Array, Surface, unit
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
 
-# Radii at a bone's start and end in metres, for a leg of 80 cm; a bone belongs to the part it starts at.
-_RADII = {
-    Part.NECK: (0.050, 0.046),
-    Part.SHOULDER: (0.052, 0.056),
-    Part.UPPER_ARM: (0.047, 0.042),
-    Part.LOWER_ARM: (0.037, 0.026),
-    Part.HAND: (0.033, 0.026),
-    Part.FINGER: (0.009, 0.008),
-    Part.UPPER_LEG: (0.078, 0.057),
-    Part.LOWER_LEG: (0.050, 0.034),
-    Part.OTHER: (0.015, 0.012),
+_X, _Y, _Z = np.eye(3)
+# Sections by part, metres for a person of 1.75 m: share of the bone, half width, half depth, offsets along both.
+# Widths of arms and hands are along the ground, of all else to the left.
+_SECTIONS = {
+    Part.NECK: [(-0.3, 0.062, 0.060, 0, 0), (0.4, 0.054, 0.056, 0, 0.004), (1.2, 0.052, 0.056, 0, 0.008)],
+    Part.UPPER_ARM: [
+        (-0.06, 0.054, 0.050, 0, 0),
+        (0.12, 0.060, 0.056, 0, 0),
+        (0.45, 0.050, 0.047, 0.003, 0),
+        (0.75, 0.043, 0.042, 0, 0),
+        (1.0, 0.040, 0.039, 0, 0),
+    ],
+    Part.LOWER_ARM: [
+        (0.0, 0.040, 0.039, 0, 0),
+        (0.22, 0.044, 0.041, 0, 0),
+        (0.65, 0.034, 0.029, 0, 0),
+        (1.0, 0.030, 0.022, 0, 0),
+    ],
+    Part.UPPER_LEG: [
+        (-0.08, 0.082, 0.080, 0, 0),
+        (0.10, 0.086, 0.090, 0, 0),
+        (0.45, 0.075, 0.080, 0, 0.006),
+        (0.85, 0.058, 0.062, 0, 0.004),
+        (1.0, 0.053, 0.057, 0, 0.002),
+    ],
+    Part.LOWER_LEG: [
+        (0.0, 0.052, 0.056, 0, 0.002),
+        (0.12, 0.051, 0.055, 0, -0.006),
+        (0.30, 0.055, 0.059, 0, -0.014),
+        (0.60, 0.043, 0.046, 0, -0.008),
+        (0.88, 0.034, 0.038, 0, -0.004),
+        (1.0, 0.034, 0.042, 0, -0.004),
+    ],
 }
-# Bones from the trunk to a limb, by the part they lead to.
-_LINKS = {
-    Part.UPPER_LEG: (0.092, 0.081),
-    Part.HIPS: (0.092, 0.084),
-    Part.SHOULDER: (0.060, 0.056),
-    Part.UPPER_ARM: (0.060, 0.056),
-    Part.OTHER: (0.015, 0.012),
+_TRUNK = [  # from between the hip joints to the neck
+    (-0.10, 0.085, 0.085, 0, -0.010),
+    (0.02, 0.150, 0.108, 0, -0.012),
+    (0.14, 0.160, 0.108, 0, -0.008),
+    (0.38, 0.136, 0.094, 0, 0.004),
+    (0.62, 0.150, 0.106, 0, 0.004),
+    (0.80, 0.160, 0.112, 0, 0.006),
+    (0.93, 0.125, 0.088, 0, -0.006),
+    (1.02, 0.062, 0.062, 0, -0.008),
+]
+_PALM = [  # from the wrist, a hand's length along it
+    (0.0, 0.030, 0.022, 0, 0),
+    (0.20, 0.037, 0.020, 0, 0),
+    (0.48, 0.043, 0.016, 0, 0),
+    (0.75, 0.039, 0.013, 0, -0.004),
+    (0.90, 0.030, 0.013, 0, -0.009),
+    (0.98, 0.022, 0.012, 0, -0.012),
+]
+_HAND = 0.185
+_HEAD = (  # centre ahead of and above the head joint, and half axes to the left, up and ahead
+    ((0.0, 0.122, 0.002), (0.076, 0.088, 0.094)),  # cranium
+    ((0.0, 0.058, 0.036), (0.056, 0.068, 0.056)),  # face
+    ((0.0, 0.018, 0.062), (0.030, 0.022, 0.030)),  # chin
+    ((0.0, 0.072, 0.104), (0.010, 0.022, 0.018)),  # nose
+    ((0.078, 0.088, -0.002), (0.008, 0.028, 0.016)),  # ears
+    ((-0.078, 0.088, -0.002), (0.008, 0.028, 0.016)),
+)
+_SHOE = [  # from the heel to the ball, along the sole
+    (0.0, 0.033, 0.042, 0, 0),
+    (0.35, 0.035, 0.042, 0, 0),
+    (0.75, 0.043, 0.038, 0, 0.004),
+    (1.0, 0.046, 0.034, 0, 0.006),
+]
+_TOE = [(0.0, 0.046, 0.034, 0, 0), (0.5, 0.043, 0.028, 0, 0.004), (1.0, 0.034, 0.020, 0, 0.010)]
+_GRID = (0.023, 0.011)  # metres between the lines of the grid, and where hands, feet and head are
+_MOST_LINES = 120  # of the coarse grid along an axis, whatever the proportions
+_SMOOTHINGS, _LEAST_SHARE = 16, 0.05  # of the joints' shares over the mesh, each over a triangle's edge
+_CARRIERS = 4  # joints a vertex, which is what viewers of glTF take
+_SKIN, _HAIR, _TROUSERS = (colours.rgb(code) for code in (colours.SKIN, colours.HAIR, colours.TROUSERS))
+_SIDES = {Side.LEFT: (1.0, colours.rgb(colours.LEFT)), Side.RIGHT: (-1.0, colours.rgb(colours.RIGHT))}
+_STICKS = {
+    **{Part.HIPS: 0.10, Part.TORSO: 0.11, Part.SHOULDER: 0.055, Part.NECK: 0.055, Part.HEAD: 0.09},
+    **{Part.UPPER_ARM: 0.045, Part.LOWER_ARM: 0.035, Part.HAND: 0.035, Part.FINGER: 0.01},
+    **{Part.UPPER_LEG: 0.07, Part.LOWER_LEG: 0.045, Part.FOOT: 0.045, Part.TOES: 0.045},
 }
-_TRUNK = ((0.0, 0.35, 0.75, 1.0), (0.100, 0.096, 0.110, 0.060))
-"""Shares of the distance from hips to neck, and the trunk's radius there, metres."""
-_OVERLAP = 0.93
-"""A trunk bone starts thinner than the one below ends, so that their skins cut cleanly."""
-_TRUNK_PARTS = (Part.HIPS, Part.TORSO)
-_TRUNK_SQUASH = (1.22, 1.0, 0.86)
-_HAND_SQUASH = (0.55, 1.0, 1.25)
-_SKULL = (0.082, 0.112, 0.098)
-_VISOR = (0.079, 0.046, 0.088)
-_EDGE = 0.022
-"""Rounding of the shoes' edges, metres."""
-_BOXED = (Part.HEAD, Part.FOOT, Part.TOES)
-"""Parts drawn as skull and shoes instead of one capsule a bone."""
+"""Radii of bones as sticks and as they cast shadows, metres."""
 
 
 @dataclass(frozen=True, eq=False)
-class Bones:
-    """Capsules between two points each; arrays over bones."""
+class Piece:
+    """A solid of the body, its colour, and the joints that carry it."""
 
-    ends: Array
-    """(bones, 2) point indices."""
-    radius: Array
-    """(bones, 2) metres."""
-    squash: Array
-    """(bones, 3) factors of the rounding."""
+    solid: Solid
     rgb: Array
-    """(bones, 3) sRGB."""
-    height: Array
-    """(bones,) share of the distance from hips to shoulders; decides the direction in which a bone is flattened."""
+    """(3,) sRGB."""
+    joints: Sequence[tuple[float, int]]
+    """Rising shares of the axis, and the joint from each on; below the first, too, the first."""
 
 
-class Mannequin:
-    """The body of one actor over a whole motion."""
+@dataclass(frozen=True, eq=False)
+class Border:
+    """A plane beyond which what has one colour has another one, in some pieces."""
 
-    def __init__(self, motion: Motion, colour: Array):
-        self.anatomy = Anatomy(motion)
-        self.colour = colour
-        self.bones = _build_bones(self.anatomy, colour)
-        self._left = self.anatomy.left(Part.UPPER_LEG), self.anatomy.left(Part.UPPER_ARM)
+    pieces: frozenset[int]
+    """Numbers of the pieces; those that have another colour keep it."""
+    point: Array
+    """(3,) on the plane, metres."""
+    normal: Array
+    """(3,) unit."""
+    old: Array
+    """(3,) sRGB before it."""
+    new: Array
+    """(3,) sRGB beyond it."""
 
-    @property
-    def num_frames(self) -> int:
-        """Frames of the motion."""
-        return len(self.anatomy.points.world)
 
-    @property
-    def seen(self) -> Array:
-        """Positions (frames, n, 3) of hips and all below, metres, without a root on the floor."""
-        return self.anatomy.seen
+def build_skin(motion: Motion, colour: str = "slate") -> CharacterMesh:
+    """Build the body of a motion, with the hips at the origin; its frames show when feet are flat and how joints turn
+    on average, so it should hold more than one step.
 
-    def boxes(self, frame: int) -> tuple[RoundedBoxes, Array]:
-        """Return limbs and trunk, skull and shoes in one frame, and the joints (parts,) that carry them."""
-        anatomy, head = self.anatomy, self.anatomy.find(Part.HEAD)
-        found = [(self._capsules(frame), self.bones.ends[:, 0])]
-        if head is not None:
-            found.append((_skull(anatomy, head, frame, self.colour), np.array([head, head])))
+    `colour` is the shirt's: a name of `colours.ACTORS` or `#rrggbb`; RequestError otherwise.
+    """
+    return _Builder(Anatomy(motion), colours.rgb(colour)).build()
+
+
+class _Builder:
+    """Builds a body in the bind pose of its anatomy, solid by solid."""
+
+    def __init__(self, anatomy: Anatomy, colour: Array):
+        self.anatomy, self.colour, self.pieces = anatomy, colour, list[Piece]()
+        self.borders = list[Border]()
+        self._trousers = colours.blend_colours(colour, _TROUSERS, 0.8)
+        self.place, self.frames = anatomy.bind_pose
+        self.low = anatomy.scale
+        self.high = self._measure_upper_body()
+        legs = [limb for limb in anatomy.limbs if limb.parts[0] is Part.UPPER_LEG]
+        top = next((j for part in (Part.NECK, Part.HEAD) if (j := anatomy.find(part)) is not None), None)
+        if top is None or len(legs) < 2:
+            self._add_bones()
+            return
+        self._add_trunk(top, legs)
+        self._add_head()
+        for leg in legs:
+            self._add_leg(leg)
+        for arm in anatomy.limbs:
+            if arm.parts[0] is Part.UPPER_ARM:
+                self._add_arm(arm, top)
+        self._dress(top)
         for foot in anatomy.feet:
-            toe = foot.ball if foot.ball < anatomy.joints else foot.ankle
-            found.append((_shoe(anatomy, foot, frame), np.array([foot.ankle, toe][: len(foot.bones)])))
-        boxes, joints = zip(*found, strict=True)
-        names = ("centre", "frame", "half", "radius", "squash", "rgb")
-        whole = RoundedBoxes(*(np.concatenate([getattr(box, name) for box in boxes]) for name in names))
-        return whole, np.concatenate(joints)
+            self._add_shoe(foot)
 
-    def surface(self, frame: int) -> Surface:
-        """Return the whole body in one frame."""
-        return self.boxes(frame)[0].surface()
-
-    def sticks(self, frame: int) -> tuple[Array, Array, Array]:
-        """Return all bones with those of head and feet: ends (n, 2, 3) and radii (n,) in metres, colours (n, 3)."""
-        ends, radius, rgb = self._sticks
-        return self.anatomy.points.world[frame, ends], radius, rgb
-
-    @cached_property
-    def _sticks(self) -> tuple[Array, Array, Array]:
-        anatomy, bones = self.anatomy, self.bones
-        shoes = [(joints, foot) for foot in anatomy.feet for joints in foot.bones]
-        head = anatomy.find(Part.HEAD)
-        crown = [(head, tip) for tip in anatomy.children(head) if tip >= anatomy.joints][:1] if head is not None else []
-        ends = np.array([*map(tuple, bones.ends), *(joints for joints, _ in shoes), *crown]).reshape(-1, 2)
-        wide = np.array([0.045] * len(shoes) + [0.09] * len(crown)) * anatomy.scale
-        rgb = [*bones.rgb, *(_limb_colour(foot.side) for _, foot in shoes), *(self.colour for _ in crown)]
-        return (
-            ends,
-            np.concatenate([bones.radius.mean(axis=1) * bones.squash[:, 0], wide]),
-            np.array(rgb).reshape(-1, 3),
+    def build(self) -> CharacterMesh:
+        """Mesh the solids, colour the mesh, and share its vertices out to the joints."""
+        solids, count = [piece.solid for piece in self.pieces], self.anatomy.joints
+        vertices, normals, faces = mesh_union(solids, self._lay_grid(), self.low)
+        nearest = np.argmin([solid.distance(vertices) for solid in solids], axis=0)
+        joint = np.zeros(len(vertices), int)
+        for number, piece in enumerate(self.pieces):
+            starts, joints = zip(*piece.joints, strict=True)
+            band = np.searchsorted(starts, piece.solid.share(vertices[nearest == number]), side="right") - 1
+            joint[nearest == number] = np.array(joints)[np.maximum(band, 0)]
+        carriers, weights = _smooth_shares(joint, faces, count)
+        vertices, rgb = self._colour(vertices, faces, nearest)
+        # An edge between colours is sharp where each has vertices of its own.
+        alike = np.column_stack([faces.reshape(-1), np.repeat(rgb, 3, axis=0)])
+        kept, corners = np.unique(alike, axis=0, return_inverse=True)
+        own = kept[:, 0].astype(int)
+        return CharacterMesh(
+            vertices=vertices[own],
+            normals=normals[own],
+            faces=corners.reshape(-1, 3),
+            rgba=np.column_stack([kept[:, 1:], np.ones(len(kept))]),
+            joints=carriers[own],
+            weights=weights[own],
+            rest=self.place[:count],
+            frames=self.frames,
         )
 
-    def _capsules(self, frame: int) -> RoundedBoxes:
-        bones, world = self.bones, self.anatomy.points.world[frame]
-        start, stop = world[bones.ends[:, 0]], world[bones.ends[:, 1]]
-        low, high = self._left[0][frame], self._left[1][frame]
-        across = low + (high - low) * bones.height[:, None]
-        half = np.linalg.norm(stop - start, axis=1) / 2
-        zero = np.zeros_like(half)
-        return RoundedBoxes(
-            centre=(start + stop) / 2,
-            frame=frame_along(stop - start, across),
-            half=np.stack([zero, half, zero], axis=1),
-            radius=bones.radius,
-            squash=bones.squash,
-            rgb=bones.rgb,
-        )
+    def _colour(self, vertices: Array, faces: Array, nearest: Array) -> tuple[Array, Array]:
+        """Return vertices (n, 3), those near a border moved onto it, and the faces' colours (m, 3)."""
+        piece, vertices = nearest[faces[:, 0]], vertices.copy()
+        rgb = np.array([one.rgb for one in self.pieces])[piece]
+        edges = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+        for border in self.borders:
+            height = (vertices - border.point) @ border.normal
+            crossing = edges[height[edges[:, 0]] * height[edges[:, 1]] < 0]
+            nearer = crossing[np.arange(len(crossing)), np.abs(height[crossing]).argmin(axis=1)]
+            close = np.unique(nearer[np.isin(nearest[nearer], list(border.pieces))])
+            vertices[close] -= height[close, None] * border.normal
+            beyond = (vertices[faces].mean(axis=1) - border.point) @ border.normal > 1e-4 * self.low
+            rgb[beyond & (rgb == border.old).all(axis=1) & np.isin(piece, list(border.pieces))] = border.new
+        return vertices, rgb
+
+    def _add(
+        self,
+        joint: int | Sequence[tuple[float, int]],
+        start: Array,
+        end: Array,
+        rows: Sequence[Sequence[float]],
+        size: float,
+        across: Array,
+        rgb: Array,
+        floor: float = -np.inf,
+    ) -> int:
+        """Add a solid with sections `size` times as large; return its number."""
+        solid = Solid(start, end, across, np.array(rows, float) * [1, size, size, size, size], floor)
+        self.pieces.append(Piece(solid, rgb, [(0.0, joint)] if isinstance(joint, int) else joint))
+        return len(self.pieces) - 1
+
+    def _split(self, pieces: Sequence[int], point: Array, normal: Array, old: Array, new: Array) -> None:
+        self.borders.append(Border(frozenset(pieces), point, unit(normal), old, new))
+
+    def _measure_upper_body(self) -> float:
+        """Return the scale of trunk, arms and head: that of trunk and arms, but not far from that of the legs."""
+        neck = self.anatomy.find(Part.NECK)
+        found = [] if neck is None else [np.linalg.norm(self.place[neck] - self.place[self.anatomy.hips]) / 0.51]
+        for limb in self.anatomy.limbs:
+            if limb.parts[0] is Part.UPPER_ARM:
+                found.append(np.linalg.norm(self.place[limb.joints[-1]] - self.place[limb.joints[0]]) / 0.54)
+        return float(np.clip(np.mean(found or [self.low]), 0.8 * self.low, 1.25 * self.low))
+
+    def _add_trunk(self, top: int, legs: Sequence[Limb]) -> None:
+        place, base = self.place, self.place[[leg.joints[0] for leg in legs]].mean(axis=0)
+        chain, hips = self.anatomy.find_path(top), self.anatomy.hips
+        chain = chain[: chain.index(hips) + 1] if hips in chain else chain
+        along = place[top] - base
+        shares = [(float((place[j] - base) @ along / (along @ along)), j) for j in reversed(chain)]
+        trunk = self._add(shares, base, place[top], _TRUNK, self.high, _X, self.colour)
+        self._split([trunk], base + 0.24 * along, -along, self.colour, self._trousers)
+        head = self.anatomy.find(Part.HEAD)
+        if head is not None and head != top:
+            self._add(top, place[top], place[head], _SECTIONS[Part.NECK], self.high, _X, self.colour)
+
+    def _dress(self, top: int) -> None:
+        """Draw the collar, and where hair begins."""
+        every, head = range(len(self.pieces)), self.anatomy.find(Part.HEAD)
+        collar = self.place[top] + np.array([0.0, 0.036, 0.0]) * self.high
+        self._split(every, collar, np.array([0.0, 1.0, 0.3]), self.colour, _SKIN)
+        if head is not None:
+            line = self.place[head] + np.array([0.0, 0.085, 0.0]) * self.high
+            self._split(every, line, np.array([0.0, 1.0, -1.15]), _SKIN, _HAIR)
+
+    def _add_ball(self, joint: int, centre: Array, axes: Sequence[float], size: float, rgb: Array) -> None:
+        """Add an ellipsoid with half axes across, up and ahead."""
+        wide, tall, deep = axes
+        half = max(tall - (wide * deep) ** 0.5, 1e-3) * size * _Y
+        self._add(joint, centre - half, centre + half, [(0, wide, deep, 0, 0), (1, wide, deep, 0, 0)], size, _X, rgb)
+
+    def _add_head(self) -> None:
+        head = self.anatomy.find(Part.HEAD)
+        if head is not None:
+            for centre, axes in _HEAD:
+                self._add_ball(head, self.place[head] + np.array(centre) * self.high, axes, self.high, _SKIN)
+
+    def _add_leg(self, leg: Limb) -> None:
+        hip, knee, ankle = self._find_ends(leg)
+        first, own, size = leg.joints[0], _SIDES[leg.side][1], self.low
+        self._add_ball(first, hip + np.array([0.0, -0.005, -0.042]) * size, (0.080, 0.085, 0.080), size, self._trousers)
+        self._add(first, hip, knee, _SECTIONS[Part.UPPER_LEG], size, -_X, self._trousers)
+        shin = self._add(leg.middle, knee, ankle, _SECTIONS[Part.LOWER_LEG], size, -_X, self._trousers)
+        self._split([shin], knee + 0.4 * (ankle - knee), ankle - knee, self._trousers, own)
+
+    def _add_arm(self, arm: Limb, top: int) -> None:
+        shoulder, elbow, wrist = self._find_ends(arm)
+        (sign, own), size, first = _SIDES[arm.side], self.high, arm.joints[0]
+        inner = self.place[top] + np.array([sign * 0.03, -0.035, -0.01]) * size
+        rows = [(0.0, 0.050, 0.034, 0, 0), (1.0, 0.052, 0.048, 0, 0)]
+        self._add(self.anatomy.points.parents[first], inner, shoulder, rows, size, _Z, self.colour)
+        upper = self._add(first, shoulder, elbow, _SECTIONS[Part.UPPER_ARM], size, sign * _Z, self.colour)
+        self._split([upper], (shoulder + elbow) / 2, elbow - shoulder, self.colour, own)
+        lower = self._add(arm.middle, elbow, wrist, _SECTIONS[Part.LOWER_ARM], size, sign * _Z, own)
+        self._split([lower], elbow + 0.88 * (wrist - elbow), wrist - elbow, own, _SKIN)
+        self._add_hand(arm)
+
+    def _find_ends(self, limb: Limb) -> Array:
+        return self.place[[limb.joints[0], limb.middle, limb.joints[-1]]]
+
+    def _add_hand(self, arm: Limb) -> None:
+        """Add a palm, and a thumb and fingers in one where the rig has no fingers of its own."""
+        hand, size, (sign, _) = arm.joints[-1], self.high, _SIDES[arm.side]
+        wrist, points = self.place[hand], self.anatomy.points
+        carrier = hand if hand < self.anatomy.joints else arm.middle
+        fingers = [k for k, role in enumerate(points.roles) if role == Role(arm.side, Part.FINGER)]
+        rows = _PALM[:3] if len(fingers) > 2 else _PALM
+        self._add(carrier, wrist, wrist + _HAND * size * arm.direction, rows, size, sign * _Z, _SKIN)
+        if len(fingers) > 2:
+            for point in fingers:
+                parent = points.parents[point]
+                if points.roles[parent].part is Part.FINGER:
+                    self._add_capsule(parent, point, 0.009, _SKIN)
+        else:
+            root, tip = ((a * arm.direction + b * _Z) * size + wrist for a, b in ((0.035, 0.020), (0.095, 0.062)))
+            self._add(carrier, root, tip, [(0, 0.016, 0.016, 0, 0), (1, 0.011, 0.011, 0, 0)], size, _Y, _SKIN)
+
+    def _add_shoe(self, foot: Foot) -> None:
+        size, own = self.low, _SIDES[foot.side][1]
+        ankle, ball = self.place[foot.ankle], self.place[foot.ball]
+        floors = ankle[1] - foot.heights[0], ball[1] - foot.heights[1]
+        toe = foot.ball if foot.ball < self.anatomy.joints else foot.ankle
+        heel = np.array([ankle[0], floors[0] + 0.040 * size, ankle[2] - 0.030 * size])
+        front = np.array([ball[0], floors[1] + 0.032 * size, ball[2]])
+        self._add(foot.ankle, heel, front, _SHOE, size, _X, own, floors[0])
+        instep = [(0, 0.036, 0.040, 0, 0), (1, 0.036, 0.024, 0, 0)]
+        self._add(foot.ankle, ankle, ankle + 0.8 * (front - ankle), instep, size, _X, own, floors[0])
+        reach = 0.05 * size if foot.tip is None else max(self.place[foot.tip][2] - ball[2] - 0.012 * size, 0.03 * size)
+        self._add(toe, front, front + np.array([0, -0.008 * size, reach]), _TOE, size, _X, own, floors[1])
+
+    def _add_bones(self) -> None:
+        """Add thin capsules for all bones, of a rig that is not recognised as a person's."""
+        hips, parents, extent = self.anatomy.hips, self.anatomy.points.parents, np.ptp(self.place, axis=0).max()
+        self.low = extent / 1.7 if extent > 0 else self.low
+        for point, parent in [(k, p) for k, p in enumerate(parents) if p >= hips] or [(hips, hips)]:
+            self._add_capsule(parent, point, 0.02 if extent > 0 else 0.09, self.colour)
+
+    def _add_capsule(self, joint: int, point: int, radius: float, rgb: Array) -> None:
+        rows = [(0, radius, radius, 0, 0), (1, radius, radius, 0, 0)]
+        self._add(joint, self.place[joint], self.place[point], rows, self.low, _X, rgb)
+
+    def _lay_grid(self) -> list[Array]:
+        """Return the grid's lines along x, y and z: finer where hands, feet and head are."""
+        low, high = (np.array(corner) for corner in zip(*(piece.solid.bounds for piece in self.pieces), strict=True))
+        extent = (high.max(axis=0) - low.min(axis=0)).max()
+        coarse, fine = (step * max(self.low, extent / _MOST_LINES / _GRID[0]) for step in _GRID)
+        parts = [self.anatomy.points.roles[piece.joints[0][1]].part for piece in self.pieces]
+        small = np.array([part in (Part.HAND, Part.FINGER, Part.HEAD, Part.TOES, Part.FOOT) for part in parts])
+        lines = []
+        for axis in range(3):
+            at, end = [low[:, axis].min() - 3 * coarse], high[:, axis].max() + 3 * coarse
+            while at[-1] < end:
+                inside = small & (low[:, axis] - coarse < at[-1]) & (at[-1] < high[:, axis])
+                at.append(at[-1] + (fine if inside.any() else coarse))
+            lines.append(np.array(at))
+        return lines
 
 
-def _build_bones(anatomy: Anatomy, colour: Array) -> Bones:
-    # No bone leads from a floor root to the hips; none is within skull and shoes, or without length.
-    rest = anatomy.points.world[0]
-    pairs = [
-        (parent, child)
-        for child, parent in enumerate(anatomy.points.parents)
-        if parent >= anatomy.hips and child > anatomy.hips and anatomy.points.roles[parent].part not in _BOXED
-        if np.linalg.norm(rest[child] - rest[parent]) > 0.005 * anatomy.scale
-    ]
-    ends = pairs or [(anatomy.hips, anatomy.hips)]  # a lone joint is a ball
-    shares = _trunk_shares(anatomy)
-    return Bones(
-        ends=np.array(ends),
-        radius=np.array([_radii(anatomy, child, parent, shares) for parent, child in ends]) * anatomy.scale,
-        squash=np.array([_squash(anatomy, child, parent) for parent, child in ends]),
-        rgb=np.array([_colour(anatomy, parent, colour) for parent, _ in ends]),
-        height=shares[np.array(ends)].mean(axis=1),
-    )
+def _smooth_shares(joint: Array, faces: Array, count: int) -> tuple[Array, Array]:
+    """Return the joints (n, 4) that carry vertices, and their shares: those of the vertices around, again and again."""
+    n, pairs = len(joint), np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    near = scipy.sparse.csr_array((np.ones(len(pairs)), pairs.T), shape=(n, n)) + scipy.sparse.eye_array(n)
+    near = near.multiply(1 / near.sum(axis=1)[:, None]).tocsr()
+    shares = np.eye(count)[joint]
+    for _ in range(_SMOOTHINGS):
+        shares = near @ shares
+    carriers = np.argsort(-shares, axis=1, kind="stable")[:, :_CARRIERS]
+    weights = np.take_along_axis(shares, carriers, axis=1)
+    weights[weights < _LEAST_SHARE] = 0.0
+    return carriers, weights / weights.sum(axis=1, keepdims=True)
 
 
-def _trunk_shares(anatomy: Anatomy) -> Array:
-    """Return every point's share of the distance from hips to neck along the bones; 0 for legs, 1 for arms and head."""
-    points, top = anatomy.points, anatomy.find(Part.NECK)
-    top = anatomy.find(Part.HEAD) if top is None else top
-    length = np.zeros(len(points.parents))
-    for point, parent in enumerate(points.parents):
-        if point > anatomy.hips and parent >= 0:
-            length[point] = length[parent] + np.linalg.norm(points.world[0, point] - points.world[0, parent])
-    legs = (Part.UPPER_LEG, Part.LOWER_LEG, Part.FOOT, Part.TOES)
-    low = np.array([role.part in legs for role in points.roles])
-    whole = length[top] if top is not None and length[top] > 0 else 0.5 * anatomy.scale
-    return np.where(low, 0.0, np.clip(length / whole, 0.0, 1.0))
+class Body:
+    """The mesh of a character moved by its joints, over a whole motion, and the anatomy below it."""
 
-
-def _is_link(anatomy: Anatomy, child: int, parent: int) -> bool:
-    """Return whether a bone leads from the trunk to a limb."""
-    below, above = anatomy.points.roles[child], anatomy.points.roles[parent]
-    return above.part in _TRUNK_PARTS and (below.part in _LINKS) and below.side is not Side.MIDDLE
-
-
-def _radii(anatomy: Anatomy, child: int, parent: int, shares: Array) -> tuple[float, float]:
-    below, above = anatomy.points.roles[child].part, anatomy.points.roles[parent].part
-    if above is Part.HAND and below is Part.FINGER:
-        return 0.016, 0.013
-    if _is_link(anatomy, child, parent):
-        return _LINKS[below]
-    if above in _TRUNK_PARTS and anatomy.points.roles[parent].side is Side.MIDDLE:
-        start, stop = np.interp(shares[[parent, child]], *_TRUNK)
-        return float(start) * _OVERLAP, float(stop)
-    return _RADII.get(above, _LINKS[Part.UPPER_LEG])
-
-
-def _squash(anatomy: Anatomy, child: int, parent: int) -> tuple[float, float, float]:
-    above = anatomy.points.roles[parent]
-    if above.part in _TRUNK_PARTS and not _is_link(anatomy, child, parent):
-        return _TRUNK_SQUASH
-    return _HAND_SQUASH if above.part is Part.HAND else (1.0, 1.0, 1.0)
-
-
-def _colour(anatomy: Anatomy, parent: int, colour: Array) -> Array:
-    role = anatomy.points.roles[parent]
-    if role.part in (*_TRUNK_PARTS, Part.SHOULDER) or role.side is Side.MIDDLE:
-        return _lighten(colour) if role.part is Part.NECK else colour
-    return _limb_colour(role.side)
-
-
-def _limb_colour(side: Side) -> Array:
-    return colours.rgb(colours.LEFT if side is Side.LEFT else colours.RIGHT)
-
-
-def _skull(anatomy: Anatomy, head: int, frame: int, colour: Array) -> RoundedBoxes:
-    """Return a head with a dark visor where it faces."""
-    scale, turn = anatomy.scale, anatomy.rotations[frame, head] @ anatomy.head_axes
-    middle = anatomy.points.world[frame, head] + turn @ np.array([0.0, 0.085, 0.012]) * scale
-    visor = middle + turn @ np.array([0.0, 0.014, 0.021]) * scale
-    return RoundedBoxes(
-        centre=np.stack([middle, visor]),
-        frame=np.stack([turn, turn]),
-        half=np.zeros((2, 3)),
-        radius=np.full((2, 2), scale),
-        squash=np.array([_SKULL, _VISOR]),
-        rgb=np.stack([_lighten(colour), colours.rgb(colours.VISOR)]),
-    )
-
-
-def _lighten(colour: Array) -> Array:
-    """Return the colour of head and neck, a little lighter than the trunk."""
-    return colours.blend_colours(colour, np.ones(3), 0.18)
-
-
-def _shoe(anatomy: Anatomy, foot: Foot, frame: int) -> RoundedBoxes:
-    """Build heel to ball and, where there are toes, ball to tip; soles on the ground when the foot is flat."""
-    world, scale = anatomy.points.world[frame], anatomy.scale
-    turn, boxes = anatomy.rotations[frame, foot.ankle] @ foot.axes, []
-    reach = float(turn[:, 2] @ (world[foot.ball] - world[foot.ankle])) + (0.03 if foot.tip is None else 0.01) * scale
-    boxes.append(_sole(world[foot.ankle], turn, -foot.heights[0], (-0.055 * scale, reach), 0.085, scale))
-    if foot.tip is not None:
-        turn = anatomy.rotations[frame, foot.ball] @ foot.toe_axes
-        reach = max(float(turn[:, 2] @ (world[foot.tip] - world[foot.ball])), 0.04 * scale)
-        boxes.append(_sole(world[foot.ball], turn, -foot.heights[1], (-0.035 * scale, reach), 0.055, scale))
-    centre, frames, half = (np.stack(values) for values in zip(*boxes, strict=True))
-    many, leather = len(boxes), colours.blend_colours(_limb_colour(foot.side), np.zeros(3), 0.28)
-    return RoundedBoxes(
-        centre, frames, half, np.full((many, 2), _EDGE * scale), np.ones((many, 3)), np.tile(leather, (many, 1))
-    )
-
-
-def _sole(joint: Array, turn: Array, floor: float, along: tuple[float, float], thick: float, scale: float):
-    """Return the centre, frame and half extents of a box with its floor over a joint and its reach along it, metres."""
-    middle = np.array([0.0, floor + thick * scale / 2, sum(along) / 2])
-    half = np.array([0.045 * scale, thick * scale / 2, (along[1] - along[0]) / 2])
-    return joint + turn @ middle, turn, np.maximum(half - _EDGE * scale, 0.0)
-
-
-class SkinnedBody:
-    """The mesh of a character, moved by its joints; its bones and marks are those of another body in the same place."""
-
-    def __init__(self, mesh: CharacterMesh, motion: Motion, bones: Mannequin):
-        """`motion` is on the joints of the mesh, frame by frame that of `bones`. MapctlError where it is not."""
-        if motion.num_joints != len(mesh.rest) or motion.num_frames != bones.num_frames:
+    def __init__(self, motion: Motion, mesh: CharacterMesh, anatomy: Anatomy, colour: Array):
+        """`motion` is on the joints of the mesh, frame by frame that of `anatomy`, and `colour` (3,) that of its bones
+        in the middle, where bones are drawn. MapctlError where the mesh has other joints."""
+        if motion.num_joints != len(mesh.rest) or motion.num_frames != len(anatomy.rotations):
             found = f"{motion.num_joints} joints and {motion.num_frames} frames"
-            raise MapctlError(f"a mesh of {len(mesh.rest)} joints and {bones.num_frames} frames got {found}")
-        self._mesh, self._bones = mesh, bones
+            raise MapctlError(f"a mesh of {len(mesh.rest)} joints and {len(anatomy.rotations)} frames got {found}")
+        self.mesh, self.anatomy, self.colour = mesh, anatomy, colour
         self._positions = motion.joint_positions().numpy()
         self._turns = rotations.to_matrix(motion.joint_rotations()).numpy()
 
-    @property
-    def anatomy(self) -> Anatomy:
-        """Hips, head and soles."""
-        return self._bones.anatomy
+    @staticmethod
+    def of(motion: Motion, colour: Array) -> "Body":
+        """Build the body of a person; its shirt has the colour (3,)."""
+        builder = _Builder(Anatomy(motion), colour)
+        return Body(motion, builder.build(), builder.anatomy, colour)
 
     @property
     def num_frames(self) -> int:
         """Frames of the motion."""
-        return self._bones.num_frames
+        return len(self._positions)
 
     @property
     def seen(self) -> Array:
         """Positions (frames, n, 3) of its bones, and of the vertices that are outermost at rest, metres."""
-        vertices = self._mesh.vertices
+        vertices = self.mesh.vertices
         outer = np.concatenate([vertices.argmin(axis=0), vertices.argmax(axis=0)])
-        joint = self._mesh.joints[outer, self._mesh.weights[outer].argmax(axis=1)]
-        turned = np.einsum("fnab,nb->fna", self._turns[:, joint], vertices[outer] - self._mesh.rest[joint])
-        return np.concatenate([self._bones.seen, self._positions[:, joint] + turned], axis=1)
+        joint = self.mesh.joints[outer, self.mesh.weights[outer].argmax(axis=1)]
+        turned = np.einsum("fnab,nb->fna", self._turns[:, joint], self.mesh.to_joints(vertices[outer], joint))
+        return np.concatenate([self.anatomy.seen, self._positions[:, joint] + turned], axis=1)
 
     def surface(self, frame: int) -> Surface:
-        """Return the mesh in one frame; it is open, as clothes and hair are, and seen from both sides."""
-        vertices, normals = self._mesh.pose(self._positions[frame], self._turns[frame])
-        return Surface(vertices, self._mesh.faces, self._mesh.rgba, normals, is_open=True)
+        """Return the mesh in one frame; it may be open, as clothes and hair are."""
+        vertices, normals = self.mesh.pose(self._positions[frame], self._turns[frame])
+        return Surface(vertices, self.mesh.faces, self.mesh.rgba, normals)
 
     def sticks(self, frame: int) -> tuple[Array, Array, Array]:
         """Return all bones in one frame: ends (n, 2, 3) and radii (n,) in metres, colours (n, 3) sRGB."""
-        return self._bones.sticks(frame)
+        ends, radii, rgb = self._sticks
+        return self.anatomy.points.world[frame, ends], radii, rgb
 
-
-Body = Mannequin | SkinnedBody
-"""Body drawn for an actor."""
-
-
-def build_skin(motion: Motion, colour: str = "slate") -> CharacterMesh:
-    """Build the body of a motion in its skeleton's rest pose, with the root at the origin; its frames show when feet
-    are flat, so it should hold more than one step. Each triangle is carried by one joint.
-
-    `colour` is the torso's: a name of `colours.ACTORS` or `#rrggbb`; RequestError otherwise.
-    """
-    body = Mannequin(motion, colours.rgb(colour))
-    boxes, joints = body.boxes(0)
-    whole = boxes.surface()
-    joint = np.repeat(joints, len(whole.vertices) // len(joints))
-    assert whole.normals is not None, "boxes are lit"
-    turn = body.anatomy.rotations[0, joint]
-    rest = place_at_rest(motion.skeleton)
-    local = np.einsum("nji,nj->ni", turn, whole.vertices - body.anatomy.points.world[0, joint])
-    return CharacterMesh(
-        vertices=local + rest[joint],
-        normals=np.einsum("nji,nj->ni", turn, whole.normals),
-        faces=whole.faces,
-        rgba=whole.rgba,
-        joints=joint[:, None],
-        weights=np.ones((len(joint), 1)),
-        rest=rest,
-    )
+    @cached_property
+    def _sticks(self) -> tuple[Array, Array, Array]:
+        points, hips = self.anatomy.points, self.anatomy.hips
+        pairs = [(p, k) for k, p in enumerate(points.parents) if p >= hips] or [(hips, hips)]
+        roles = [points.roles[parent] for parent, _ in pairs]
+        radii = np.array([_STICKS.get(role.part, 0.02) for role in roles]) * self.anatomy.scale
+        return np.array(pairs), radii, np.array([_SIDES[r.side][1] if r.side in _SIDES else self.colour for r in roles])
 
 
 def place_at_rest(skeleton: Skeleton) -> Array:

@@ -1,9 +1,4 @@
-"""Coloured triangles, and the one solid everything round is built of.
-
-A rounded box is a sphere whose eight octants are moved apart: without extent it is a ball, with extent
-along one axis a capsule, along three a box with soft edges. Every body part is one, so a character is one
-array operation.
-"""
+"""Coloured triangles, the unit sphere and frames along vectors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,12 +21,10 @@ class Surface:
     """(n, 4) sRGB colour and opacity, 0 to 1."""
     normals: Array | None = None
     """(n, 3) unit normals of a lit surface; None for flat colour."""
-    is_open: bool = False
-    """Whether it is seen from both sides; else it is the skin of solids, of which only the outside is drawn."""
 
 
 def merge_surfaces(surfaces: Sequence[Surface]) -> Surface:
-    """Merge surfaces into one, faces in the order given; all are lit or none is, and it is open if any is."""
+    """Merge surfaces into one, faces in the order given; all are lit or none is."""
     counts = np.cumsum([0, *(len(s.vertices) for s in surfaces)])
     lit = surfaces[0].normals is not None
     return Surface(
@@ -39,17 +32,12 @@ def merge_surfaces(surfaces: Sequence[Surface]) -> Surface:
         faces=np.concatenate([s.faces + start for s, start in zip(surfaces, counts, strict=False)]),
         rgba=np.concatenate([s.rgba for s in surfaces]),
         normals=np.concatenate([s.normals for s in surfaces if s.normals is not None]) if lit else None,
-        is_open=any(s.is_open for s in surfaces),
     )
 
 
 @cache
 def unit_sphere(around: int = 16, up: int = 10) -> tuple[Array, Array]:
-    """Return the unit sphere (n, 3) and its triangles; no vertex lies on a coordinate plane, so that each has an
-    octant.
-
-    `around` must be divisible by 4 and `up` even. The axis is y.
-    """
+    """Return the unit sphere (n, 3) about the y axis and its triangles."""
     polar = (np.arange(up) + 0.5) * np.pi / up
     turn = (np.arange(around) + 0.5) * 2 * np.pi / around
     ring = np.stack([np.sin(turn), np.zeros(around), np.cos(turn)], axis=-1)
@@ -62,41 +50,6 @@ def unit_sphere(around: int = 16, up: int = 10) -> tuple[Array, Array]:
     fan = np.stack([np.zeros(around - 2, int), np.arange(1, around - 1), np.arange(2, around)], axis=-1)
     caps = np.concatenate([index[0][fan], index[-1][fan[:, ::-1]]])
     return points.reshape(-1, 3), np.concatenate([sides, caps])
-
-
-@dataclass(frozen=True, eq=False)
-class RoundedBoxes:
-    """Many rounded boxes at once; `parts` of them."""
-
-    centre: Array
-    """(parts, 3) world, metres."""
-    frame: Array
-    """(parts, 3, 3) rotation: columns are the box's axes in the world."""
-    half: Array
-    """(parts, 3) half extents without the rounding, metres."""
-    radius: Array
-    """(parts, 2) rounding at the lower and upper end of the box's y axis, metres."""
-    squash: Array
-    """(parts, 3) factor on the rounding along each axis."""
-    rgb: Array
-    """(parts, 3) sRGB."""
-
-    def surface(self) -> Surface:
-        """Return all boxes as one lit surface."""
-        sphere, faces = unit_sphere()
-        octant = np.sign(sphere)
-        radius = np.where(sphere[:, 1] < 0, self.radius[:, :1], self.radius[:, 1:])[..., None]
-        local = octant * self.half[:, None] + sphere * self.squash[:, None] * radius
-        normals = sphere / self.squash[:, None]
-        normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-        turned = np.swapaxes(self.frame, 1, 2)
-        parts, corners = local.shape[:2]
-        return Surface(
-            vertices=(local @ turned + self.centre[:, None]).reshape(-1, 3),
-            faces=(faces + corners * np.arange(parts)[:, None, None]).reshape(-1, 3),
-            rgba=np.repeat(np.column_stack([self.rgb, np.ones(parts)]), corners, axis=0),
-            normals=(normals @ turned).reshape(-1, 3),
-        )
 
 
 def frame_along(axis: Array, across: Array) -> Array:

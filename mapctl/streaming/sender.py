@@ -224,6 +224,7 @@ class PoseStream:
         self.endpoints = [endpoint.offset(k, option=OPTION) for k in range(len(skeletons))]
         family, address = endpoint.resolve(option=OPTION)
         receivers = [(address, one.port) for one in self.endpoints]
+        self.guide = guide
         self._skeletons, self._root_travels, self._delay = list(skeletons), root_travels, delay
         self.statistics = StreamStatistics()
         """Summary of the messages sent; known after `close`."""

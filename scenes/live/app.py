@@ -82,7 +82,16 @@ class LiveApp:
         self.panel = Panel(self.server.gui, self, characters=len(characters))
         self.panel.show_inputs(self.chosen.inputs)
         walk_speed = min(1.2, self.limits.fastest)
-        self.driving = Driving(self._drive, self._act, self.view.find_heading, self.limits.fastest, walk_speed)
+        self.driving = Driving(
+            steer=self._drive,
+            act=self._act,
+            find_heading=self.view.find_heading,
+            find_facing=lambda: math.degrees(self.chosen.facing),
+            find_lock=self._find_lock,
+            fastest=self.limits.fastest,
+            walk_speed=walk_speed,
+        )
+        self._lock: float | None = None
         self._remote = None if source is None else RemoteCommands(source, self)
         scene.on_click()(lambda event: self.enqueue(lambda: self.click(event.ray_origin, event.ray_direction)))
         self.server.on_client_connect(lambda client: self.enqueue(lambda: self.show_all([client])))
@@ -243,7 +252,8 @@ class LiveApp:
             return
         for chunk in chunks:
             if self._stream is not None and chunk.due >= self._began:  # what was due before could only come late
-                self._stream.put(number, chunk.due, chunk.seconds, chunk.root, chunk.quats)
+                moved = (chunk.root, chunk.quats, chunk.contacts, chunk.root_velocity, chunk.trajectory)
+                self._stream.put(number, chunk.due, chunk.seconds, chunk.root, chunk.quats, self._stream.guide(*moved))
             for note in chunk.notes:
                 self.notify(character.name, note)
 
@@ -273,12 +283,26 @@ class LiveApp:
         for character in self.characters:
             self._run_safely(lambda one=character: one.pause(paused, seconds))
 
-    def _drive(self, speed: float, heading: float | None) -> None:
-        self.change(self.chosen, {"speed": speed} | ({} if heading is None else {"heading": heading}))
+    def _drive(self, speed: float, heading: float | None, facing: float | None) -> None:
+        kept = {} if heading is None else {"heading": heading}
+        self.change(self.chosen, {"speed": speed, "facing": facing} | kept)
+
+    def _find_lock(self) -> float | None:
+        """Return the locked facing of the chosen character, degrees: toward its target where there is one."""
+        inputs, position = self.chosen.inputs, self.chosen.position
+        target = inputs.look_at or next(iter(inputs.reach.values()), None)
+        if self._lock is None or target is None:
+            return self._lock
+        return math.degrees(math.atan2(target[0] - position[0], target[2] - position[1]))
+
+    def _toggle_lock(self) -> None:
+        self._lock = self.view.find_heading((0.0, 1.0), None) if self._lock is None else None
+        self.change(self.chosen, {"facing": self._find_lock()})
 
     def _act(self, key: str) -> None:
         actions: dict[str, Callable[[], Any]] = {
             "KeyX": lambda: self.change(self.chosen, {"speed": 0.0}),
+            "KeyL": self._toggle_lock,
             "KeyP": lambda: self.set_paused(not self.is_paused),
             "KeyR": self.restart,
             "KeyN": lambda: self.choose((self.characters.index(self.chosen) + 1) % len(self.characters)),

@@ -6,20 +6,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
-import trimesh
+import torch
 import viser
-from trimesh.visual import ColorVisuals
 
+from mapctl import rotations
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import MapctlError
 from mapctl.features import PRIOR_FPS
 from mapctl.mesh import colours
+from mapctl.mesh.character_mesh import CharacterMesh
 from mapctl.mesh.mannequin import at_rest, build_skin
 from mapctl.mesh.primitives import Array
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap
 from mapctl.runtime.live_protocol import FrameChunk, LiveCharacter
-from mapctl.skeleton import TOE_JOINTS, Skeleton
+from mapctl.skeleton import TOE_JOINTS
 from scenes.drawn_character import DrawnCharacter
 from scenes.live.camera import facing_of, to_rgb_bytes
 from scenes.live.inputs import SteeringInputs
@@ -37,57 +38,23 @@ Pose = tuple[Array, Array]
 """Positions (n, 3), metres, and rotations (n or more, 4), xyzw, of what a body moves."""
 
 
-class MannequinBody:
-    """The mannequin of a skeleton below a node of a scene: meshes that hang on joints."""
-
-    def __init__(self, scene: viser.SceneApi, name: str, skeleton: Skeleton, colour: str):
-        """Add the mannequin with a torso of this `colour`."""
-        body, paths = build_skin(at_rest(skeleton), colour), []
-        self._joints: list[viser.FrameHandle] = []
-        for joint, parent in enumerate(skeleton.parents):
-            paths.append(f"{paths[parent] if parent >= 0 else name}/{skeleton.names[joint]}")
-            offset = skeleton.offsets[joint].numpy()
-            self._joints.append(scene.add_frame(paths[joint], show_axes=False, position=offset))
-            faces = body.faces[body.joints[body.faces[:, 0], 0] == joint]
-            if len(faces):
-                used, packed = np.unique(faces, return_inverse=True)
-                mesh = trimesh.Trimesh(
-                    body.vertices[used] - body.rest[joint],
-                    packed.reshape(-1, 3),
-                    vertex_normals=body.normals[used],
-                    process=False,
-                )
-                mesh.visual = ColorVisuals(mesh, vertex_colors=(255 * body.rgba[used, :3]).round().astype(np.uint8))
-                scene.add_mesh_trimesh(f"{paths[joint]}/skin", mesh)
-
-    def prepare(self, motion: Motion) -> list[Pose]:
-        """Prepare the poses of frames: position of the root, and local rotation of every joint."""
-        roots, quats = motion.root_position.numpy(), motion.local_quat_xyzw.numpy()
-        return list(zip(roots[:, None], quats, strict=True))
-
-    def pose(self, pose: Pose) -> None:
-        """Move the root and turn the joints."""
-        self._joints[0].position = pose[0][0]
-        for handle, wxyz in zip(self._joints, np.roll(pose[1], 1, axis=1), strict=True):
-            handle.wxyz = wxyz
-
-
 class SkinnedBody:
-    """A character's own mesh below a node of a scene: sent with its weights, then only its bones are moved.
+    """A mesh below a node of a scene: sent with its weights, then only its bones are moved.
 
     The browser's skinned meshes have one colour, so there is one for every group of similar colours.
     """
 
-    def __init__(self, scene: viser.SceneApi, name: str, character: DrawnCharacter):
-        """Add the character's mesh in its rest pose."""
-        self._character, mesh = character, character.mesh
-        carriers = find_carriers(character.body.leveled_map)
-        self._joints, bone = np.unique(carriers, return_inverse=True)
+    def __init__(self, scene: viser.SceneApi, name: str, mesh: CharacterMesh, drawn: DrawnCharacter | None = None):
+        """Add a mesh in its rest pose: of the character that motions are put on, else on the joints that move."""
+        self._mesh, self._drawn, joints = mesh, drawn, np.arange(len(mesh.rest))
+        self._joints, bone = np.unique(
+            joints if drawn is None else find_carriers(drawn.body.leveled_map), return_inverse=True
+        )
         weights = np.zeros((len(mesh.vertices), len(self._joints)))
         rows = np.arange(len(weights))
         for joints, shares in zip(mesh.joints.T, mesh.weights.T, strict=True):
             np.add.at(weights, (rows, bone[joints]), shares)
-        # A browser shades smoothly over shared vertices only, and files have several where texture charts meet.
+        # A browser shades smoothly over shared vertices only, and there are several where colours or charts meet.
         alike = np.column_stack([mesh.vertices, weights]).round(6)
         _, first, number = np.unique(alike, axis=0, return_index=True, return_inverse=True)
         faces, rgba = first[number.reshape(-1)][mesh.faces], mesh.rgba[mesh.faces].mean(axis=1)
@@ -97,8 +64,8 @@ class SkinnedBody:
             self._add_group(scene, f"{name}/skin{group}", faces[own], rgba[own].mean(axis=0), weights)
 
     def prepare(self, motion: Motion) -> list[Pose]:
-        """Prepare the poses of frames on canonical joints with the character's bones: transforms of its bones."""
-        placed = self._character.put_on(motion).motion
+        """Prepare the poses of frames on canonical joints with the body's bones: transforms of its bones."""
+        placed = motion if self._drawn is None else self._drawn.put_on(motion).motion
         positions, quats = placed.joint_positions().numpy(), placed.joint_rotations().numpy()
         return list(zip(positions[:, self._joints], quats[:, self._joints], strict=True))
 
@@ -109,14 +76,16 @@ class SkinnedBody:
             bone.position, bone.wxyz = pose[0][joint], wxyz[joint]
 
     def _add_group(self, scene: viser.SceneApi, name: str, faces: Array, rgba: Array, weights: Array) -> None:
-        mesh = self._character.mesh
+        mesh = self._mesh
         vertices, faces = np.unique(faces, return_inverse=True)
         bones = np.flatnonzero(weights[vertices].max(axis=0) > 0)
+        frames = np.tile(np.eye(3), (len(mesh.rest), 1, 1)) if mesh.frames is None else mesh.frames
+        quats = rotations.from_matrix(torch.from_numpy(frames[self._joints[bones]])).numpy()
         handle = scene.add_mesh_skinned(
             name,
             mesh.vertices[vertices],
             faces.reshape(-1, 3),
-            bone_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (len(bones), 1)),
+            bone_wxyzs=np.roll(quats, 1, axis=1),
             bone_positions=mesh.rest[self._joints[bones]],
             skin_weights=weights[np.ix_(vertices, bones)],
             color=tuple((255 * rgba[:3]).round().astype(int).tolist()),
@@ -143,6 +112,13 @@ def find_carriers(rigmap: RigMap) -> Array:
     for joint, parent in enumerate(rigmap.rig_skeleton.parents):
         found.append(joint if joint in moving or parent < 0 else found[parent])
     return np.array(found)
+
+
+def _interpolate(first: Pose, second: Pose, share: float) -> Pose:
+    """Return the pose between two, in lines and by the shortest arcs."""
+    quats = torch.from_numpy(first[1]), torch.from_numpy(second[1])
+    turned = rotations.slerp(*quats, torch.full(quats[0].shape[:1], share, dtype=quats[0].dtype))
+    return first[0] + share * (second[0] - first[0]), turned.numpy()
 
 
 class Marks:
@@ -245,10 +221,8 @@ class ShownCharacter:
         self.frames = self.late_frames = 0
         """Frames, and late ones of them, since the last reset."""
         path, colour = f"{world}/character{number + 1}", colours.default_colour(number)
-        if look.drawn is None:
-            self._body = MannequinBody(scene, path, character.skeleton, colour)
-        else:
-            self._body = SkinnedBody(scene, path, look.drawn)
+        mesh = build_skin(at_rest(character.skeleton), colour) if look.drawn is None else look.drawn.mesh
+        self._body = SkinnedBody(scene, path, mesh, look.drawn)
         self.marks = Marks(scene, f"{world}/marks{number + 1}")
         self._waiting: deque[DueFrame] = deque()
         self._shown: DueFrame | None = None
@@ -311,13 +285,20 @@ class ShownCharacter:
         )
 
     def show_due(self, now: float) -> None:
-        """Show the newest frame that is due, a value of time.perf_counter."""
+        """Show the character at a value of time.perf_counter: between the newest frame that is due and the next one."""
         count = len(self.past)
         while self._waiting and self._waiting[0].due <= now:
             self.past.append(self._waiting.popleft())
         if len(self.past) > count:
             del self.past[: -round(KEPT_SECONDS * PRIOR_FPS)]
             self.show_past(0)
+        if self.past and self._waiting:
+            frames = self.past[-1], self._waiting[0]
+            first, second = (one.chunk.root[one.frame] for one in frames)
+            share = (now - frames[0].due) / max(frames[1].due - frames[0].due, 1e-9)
+            if 0 < share < 1 and np.linalg.norm(second - first) < _RESET_METRES:
+                self.position = (first + share * (second - first))[::2]
+                self._body.pose(_interpolate(frames[0].pose, frames[1].pose, share))
 
     def show_past(self, back: int) -> None:
         """Show the frame that is so many frames before the newest one; the oldest if there are fewer."""

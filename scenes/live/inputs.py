@@ -110,6 +110,7 @@ def parse_point(value: object) -> Point | None:
 
 ACTIONS = {
     "KeyX": "stand",
+    "KeyL": "keep facing the target, or where the camera looks now; again to end that",
     "KeyP": "pause or resume",
     "KeyR": "reset",
     "KeyN": "next character",
@@ -119,24 +120,29 @@ ACTIONS = {
 DIRECTIONS = {
     **dict.fromkeys(("KeyW", "ArrowUp"), (0.0, 1.0)),
     **dict.fromkeys(("KeyS", "ArrowDown"), (0.0, -1.0)),
-    **dict.fromkeys(("KeyA", "ArrowLeft"), (-1.0, 0.0)),
-    **dict.fromkeys(("KeyD", "ArrowRight"), (1.0, 0.0)),
+    **dict.fromkeys(("KeyA", "ArrowLeft", "KeyQ"), (-1.0, 0.0)),
+    **dict.fromkeys(("KeyD", "ArrowRight", "KeyE"), (1.0, 0.0)),
 }
 """Keys that walk: to the right of the camera and away from it."""
+STRAFE = frozenset(("KeyQ", "KeyE"))
+"""Keys of these that keep the facing."""
 FAST = frozenset(("ShiftLeft", "ShiftRight"))
 KEYS = (*ACTIONS, *DIRECTIONS, *sorted(FAST))
 """All keys that the page sends."""
 HELP = (
     ("W A S D", "walk in that direction as seen from the camera, as arrows do; release to stand"),
+    ("Q E", "walk to the left or right and keep the facing"),
     ("Shift", "run"),
     *((code.removeprefix("Key"), action) for code, action in ACTIONS.items()),
-    ("Gamepad", "left stick walks, right trigger runs"),
+    ("Gamepad", "left stick walks, right stick faces, right trigger runs"),
     ("Mouse", "drag to orbit, wheel to zoom, right drag to pan"),
 )
 """Keys and what they do, as the page lists them."""
 
 _DEAD, _FULL = 0.18, 0.95  # shares of a stick's travel that count as none and as all
 _ORDER_SECONDS, _LEAST_TURN, _LEAST_SPEED = 0.1, 2.0, 0.05  # between inputs; degrees and m/s that make another one
+Steering = tuple[float, float | None, float | None]
+"""Speed, m/s, heading and facing, degrees; None keeps the heading, and faces the direction of travel."""
 
 
 @dataclass
@@ -144,19 +150,24 @@ class Driving:
     """Held keys and sticks of each page; the first page that holds some is obeyed, and the character stands when all
     are released or their page is gone."""
 
-    steer: Callable[[float, float | None], None]
-    """Steer at a speed, m/s, in a heading, degrees; None keeps it."""
+    steer: Callable[[float, float | None, float | None], None]
+    """Steer at a speed with heading and facing (Steering)."""
     act: Callable[[str], None]
     """Do what a key of ACTIONS does."""
     find_heading: Callable[[tuple[float, float], int | None], float]
     """Return the heading, degrees, of a direction to the right and away as a viewer's camera sees it."""
+    find_facing: Callable[[], float]
+    """Return the character's facing, degrees."""
+    find_lock: Callable[[], float | None]
+    """Return the facing that is locked, degrees; None where none is."""
     fastest: float
     """The prior's fastest speed, m/s."""
     walk_speed: float = 1.2
     """Speed of a held key, m/s; Shift runs."""
     _pages: dict[int, PageState] = field(default_factory=dict)
-    _given: tuple[float, float] | None = None
+    _given: Steering | None = None
     _given_at: float = -math.inf
+    _kept: float | None = None
 
     def update(self, page: int, state: PageState | None) -> None:
         """Take the state of a page; None if it is gone."""
@@ -170,34 +181,51 @@ class Driving:
 
     def step(self, now: float) -> None:
         """Steer by what is held at a value of time.perf_counter."""
-        asked = [(*found, page.viewer) for page in self._pages.values() if (found := self._read(page)) is not None]
-        if not asked:
-            if self._given is not None:
-                self._given = None
-                self.steer(0.0, None)
-            return
-        direction, speed, viewer = asked[0]
-        heading = self.find_heading(direction, viewer)
-        if self._given is not None:
-            turned = abs(math.remainder(heading - self._given[1], 360)) >= _LEAST_TURN
-            changed = turned or abs(speed - self._given[0]) >= _LEAST_SPEED
-            if not changed or now - self._given_at < _ORDER_SECONDS:
-                return
-        self._given, self._given_at = (speed, heading), now
-        self.steer(speed, heading)
+        asked = next((found for page in self._pages.values() if (found := self._read(page)) is not None), None)
+        before = self._given
+        if asked is None:
+            self._given = self._kept = None
+            if before is not None:
+                self.steer(0.0, None, before[2])
+        elif before is None or (_differ(asked, before) and now - self._given_at >= _ORDER_SECONDS):
+            self._given, self._given_at = asked, now
+            self.steer(*asked)
 
-    def _read(self, page: PageState) -> tuple[tuple[float, float], float] | None:
-        """Return direction and speed that a page asks for; None where it requests none."""
+    def _read(self, page: PageState) -> Steering | None:
+        """Return what a page asks for; None where it asks for nothing."""
         run_speed = max(self.walk_speed, 0.75 * self.fastest)
-        if page.stick is not None:
-            right, down, trigger = page.stick
-            length = math.hypot(right, down)
-            if length > _DEAD:
-                top = self.walk_speed + (run_speed - self.walk_speed) * max(0.0, trigger)
-                push = min(1.0, (length - _DEAD) / (_FULL - _DEAD))
-                return (right / length, -down / length), round(max(0.3, top * push), 2)
-        direction = find_direction(page.keys)
-        return None if direction is None else (direction, run_speed if page.keys & FAST else self.walk_speed)
+        direction, speed = find_direction(page.keys), run_speed if page.keys & FAST else self.walk_speed
+        if page.stick is not None and (pushed := _push(page.stick)) is not None:
+            direction, push = pushed
+            top = self.walk_speed + (run_speed - self.walk_speed) * max(0.0, page.stick[2])
+            speed = round(max(0.3, top * push), 2)
+        facing = None
+        if (aimed := _push(page.aim)) is not None:
+            facing = self.find_heading(aimed[0], page.viewer)
+        elif direction is not None and (locked := self.find_lock()) is not None:
+            facing = locked
+        elif page.keys & STRAFE:
+            self._kept = facing = self.find_facing() if self._kept is None else self._kept
+        if direction is None:
+            return None if facing is None else (0.0, None, facing)
+        return speed, self.find_heading(direction, page.viewer), facing
+
+
+def _push(stick: tuple[float, ...] | None) -> tuple[tuple[float, float], float] | None:
+    """Return the direction of a stick, to the right and away, and how far it is pushed, 0 to 1; None at rest."""
+    length = 0.0 if stick is None else math.hypot(*stick[:2])
+    if stick is None or length <= _DEAD:
+        return None
+    return (stick[0] / length, -stick[1] / length), min(1.0, (length - _DEAD) / (_FULL - _DEAD))
+
+
+def _differ(one: Steering, other: Steering) -> bool:
+    """Return whether two requests differ by more than the camera's sway."""
+    turned = [
+        a is not b if a is None or b is None else abs(math.remainder(a - b, 360)) >= _LEAST_TURN
+        for a, b in zip(one[1:], other[1:], strict=True)
+    ]
+    return any(turned) or abs(one[0] - other[0]) >= _LEAST_SPEED
 
 
 def find_direction(codes: Set[str]) -> tuple[float, float] | None:

@@ -1,4 +1,4 @@
-// Sends held keys and the gamepad to mapctl live, over a socket of its own. It runs before viser's script, so that keys
+// Sends held keys, the gamepad and the sticks on a phone's screen to mapctl live, over a socket of its own. It runs before viser's script, so that keys
 // that steer do not also move viser's camera.
 (() => {
   const { keys, help } = document.currentScript.dataset;
@@ -7,16 +7,21 @@
   const held = new Set();
   let socket = null, sent = "";
 
-  const round = (value) => Math.round(value * 50) / 50;
-  const readStick = () => {
+  const touched = { move: null, aim: null, runs: false };  // sticks on the screen, -1 to 1 to the right and down
+
+  const round = (value) => Math.round((value ?? 0) * 50) / 50;
+  const readSticks = () => {
     const pad = [...(navigator.getGamepads?.() ?? [])].find((one) => one !== null && one.connected);
-    if (pad === undefined || document.hidden) return null;
-    return [pad.axes[0], pad.axes[1], pad.buttons[7]?.value].map((value) => round(value ?? 0));
+    const [x, y, right, down] = pad === undefined || document.hidden ? [] : pad.axes;
+    const stick = touched.move !== null ? [...touched.move, touched.runs ? 1 : 0]
+      : x === undefined ? null : [x, y, pad.buttons[7]?.value];
+    const aim = touched.aim ?? (right === undefined ? null : [right, down]);
+    return { stick: stick?.map(round) ?? null, aim: aim?.map(round) ?? null };
   };
   const send = () => {
     if (socket?.readyState !== WebSocket.OPEN) return;
     const viewer = document.querySelector("[data-mapctl-viewer]")?.dataset.mapctlViewer;
-    const state = JSON.stringify({ keys: [...held], stick: readStick(), viewer: viewer ? Number(viewer) : null });
+    const state = JSON.stringify({ keys: [...held], ...readSticks(), viewer: viewer ? Number(viewer) : null });
     if (state !== sent) socket.send(sent = state);
   };
   const connect = () => {
@@ -43,7 +48,7 @@
     send();
   }, true);
   window.addEventListener("keyup", (event) => { if (held.delete(event.code)) send(); }, true);
-  const letGo = () => { held.clear(); send(); };
+  const letGo = () => { held.clear(); touched.move = touched.aim = null; send(); };
   window.addEventListener("blur", letGo);
   document.addEventListener("visibilitychange", () => { if (document.hidden) letGo(); });
 
@@ -58,6 +63,42 @@
     row.insertCell().textContent = does;
   }
   list.append(table);
+
+  // Sticks and buttons for fingers. On a phone viser's panel begins folded to the bar at the bottom.
+  const touch = document.createElement("div");
+  touch.id = "mapctl-touch";
+  const add = (tag, text, name) => {
+    const element = Object.assign(document.createElement(tag), { textContent: text, id: `mapctl-${name}` });
+    touch.append(element);
+    return element;
+  };
+  const addStick = (name, text) => {
+    const base = add("div", text, name), knob = base.appendChild(document.createElement("i"));
+    const move = (event) => {
+      const { left, top, width } = base.getBoundingClientRect(), half = width / 2;
+      const at = event === null ? [0, 0] : [event.clientX - left - half, event.clientY - top - half];
+      const far = Math.max(1, Math.hypot(...at) / half);
+      knob.style.translate = at.map((value) => `${value / far}px`).join(" ");
+      touched[name] = event === null ? null : at.map((value) => value / far / half);
+      send();
+    };
+    base.addEventListener("pointerdown", (event) => { base.setPointerCapture?.(event.pointerId); move(event); });
+    base.addEventListener("pointermove", (event) => { if (touched[name] !== null) move(event); });
+    for (const end of ["pointerup", "pointercancel"]) base.addEventListener(end, () => move(null));
+  };
+  const press = (code) => { held.add(code); send(); held.delete(code); send(); };
+  addStick("move", "walk");
+  addStick("aim", "face");
+  add("button", "Run", "run").onclick = ({ target }) => { target.ariaPressed = touched.runs = !touched.runs; send(); };
+  add("button", "Stop", "stop").onclick = () => press("KeyX");
+  add("button", "Lock", "lock").onclick = () => press("KeyL");
+  const fold = setInterval(() => {
+    const panel = document.querySelector("[data-mapctl-viewer]")?.closest("[style*='position: fixed']");
+    const bar = panel?.querySelector("[style*='cursor: pointer']");
+    if (bar || innerWidth > 576) clearInterval(fold);
+    if (innerWidth <= 576) bar?.click();
+  }, 200);
+
   const style = document.createElement("style");
   style.textContent = `
     #mapctl-help { position: fixed; left: 12px; bottom: 12px; z-index: 5; font: 12px/1.4 system-ui, sans-serif;
@@ -66,8 +107,26 @@
     #mapctl-help summary { cursor: pointer; user-select: none; }
     #mapctl-help td { padding: 1px 10px 1px 0; vertical-align: top; }
     #mapctl-help kbd { font: 11px ui-monospace, monospace; white-space: nowrap; padding: 0 4px; border-radius: 3px;
-      border: 1px solid rgba(120, 130, 145, 0.45); }`;
+      border: 1px solid rgba(120, 130, 145, 0.45); }
+    #mapctl-touch { display: none; }
+    @media (pointer: coarse), (max-width: 576px) {
+      #mapctl-help { display: none; }
+      #mapctl-touch { display: contents; font: 13px system-ui, sans-serif; color: #39424e; }
+      #mapctl-touch > * { position: fixed; z-index: 5; touch-action: none; user-select: none; color: inherit;
+        background: rgba(255, 255, 255, 0.6); border: 1px solid rgba(90, 100, 115, 0.35); }
+      #mapctl-touch > div { bottom: 68px; width: 116px; height: 116px; border-radius: 50%; text-align: center;
+        line-height: 24px; }
+      #mapctl-touch i { position: absolute; left: 35px; top: 35px; width: 44px; height: 44px; border-radius: 50%;
+        background: rgba(38, 98, 184, 0.75); pointer-events: none; }
+      #mapctl-move { left: 20px; }
+      #mapctl-aim { right: 20px; }
+      #mapctl-touch > button { left: calc(50% - 34px); width: 68px; height: 36px; border-radius: 10px; }
+      #mapctl-touch > button[aria-pressed=true] { background: rgba(38, 98, 184, 0.75); color: white; }
+      #mapctl-run { bottom: 148px; }
+      #mapctl-stop { bottom: 108px; }
+      #mapctl-lock { bottom: 68px; }
+    }`;
   document.head.append(style);
-  document.addEventListener("DOMContentLoaded", () => document.body.append(list));
+  document.addEventListener("DOMContentLoaded", () => document.body.append(list, touch));
   connect();
 })();

@@ -40,7 +40,10 @@ class PageState(pydantic.BaseModel, frozen=True, extra="forbid"):
     keys: Annotated[frozenset[str], pydantic.Field(max_length=16)] = frozenset()
     """Held keys, as KeyboardEvent.code names them."""
     stick: tuple[_Share, _Share, _Share] | None = None
-    """A gamepad's left stick to the right and down, -1 to 1, and its right trigger, 0 to 1; None without one."""
+    """The left stick of a gamepad or of the screen to the right and down, -1 to 1, and the right trigger, 0 to 1; None
+    without one."""
+    aim: tuple[_Share, _Share] | None = None
+    """The right stick to the right and down, -1 to 1; None without one."""
     viewer: Annotated[int, pydantic.Field(ge=0)] | None = None
     """Number of viser's client in this page."""
 

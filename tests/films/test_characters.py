@@ -14,8 +14,9 @@ from mapctl import formats
 from mapctl.contacts import detect_contacts
 from mapctl.errors import FileFormatError, MapctlError
 from mapctl.mesh import colours
+from mapctl.mesh.anatomy import Anatomy
 from mapctl.mesh.character_mesh import CharacterMesh
-from mapctl.mesh.mannequin import Mannequin, SkinnedBody
+from mapctl.mesh.mannequin import Body
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from scenes import renderers
@@ -135,7 +136,7 @@ def test_all_of_a_character_is_in_view(folder):
     body = stage.players[0].body
     top = vertices_of(body, 6)[:, 1].max()
     assert body.seen[6, :, 1].max() == pytest.approx(top, abs=0.02), "the hat is over the head"
-    assert Mannequin(motion, GREY).seen[6, :, 1].max() < top - 0.05
+    assert Anatomy(motion).seen[6, :, 1].max() < top - 0.05
     for view, frame in zip(stage.views(CameraSettings("follow"), (160, 90)), range(12), strict=True):
         at = view.project(vertices_of(body, frame))
         assert (at[:, :2] > 0).all()
@@ -173,7 +174,7 @@ def test_one_sees_through_what_is_not_opaque_and_into_what_is_open(folder):
     clip = walk(2)
     rest = clip.joint_positions()[0].numpy()
     mesh = CharacterMesh(vertices, np.tile([0.0, 0, 1], (8, 1)), faces, rgba, *carriers, rest)
-    body = SkinnedBody(mesh, clip, Mannequin(clip, GREY))
+    body = Body(clip, mesh, Anatomy(clip), GREY)
     stage, brush = Stage([Shot(clip)]), select_painter("egl")
 
     def middle(azimuth: float) -> np.ndarray:

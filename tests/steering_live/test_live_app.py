@@ -103,6 +103,37 @@ def test_keys_and_sticks_reach_the_character(show, actors):
     assert {word for word, *_ in actors[0].heard} == {"command", "pause", "reset"}
 
 
+def test_a_lock_faces_the_target_as_the_character_passes_it(show, actors):
+    show.change(show.chosen, {"speed": 1.0})
+    show.targets.look(True)
+    show.targets.move_target((3.0, 1.1, 0.0))
+    show.chosen.position = np.array([0.0, 0.0])
+    show._act("KeyL")
+    assert actors[0].heard[-1][1].facing == pytest.approx(math.pi / 2)
+    show.chosen.position = np.array([3.0, -2.0])
+    show.driving.update(0, PageState(keys={"KeyD"}))
+    show.driving.step(0.0)
+    assert actors[0].heard[-1][1].facing == pytest.approx(0.0)
+    show._act("KeyL")
+    assert actors[0].heard[-1][1].facing is None
+
+
+def test_poses_are_shown_between_frames(show):
+    chunk = delivered(60)
+    show.chosen.character.poll = lambda: [chunk]
+    show.chosen.receive()
+    (first, second, _), body = show.chosen._waiting, show.chosen._body
+    shown = []
+    body.pose = shown.append
+    show.chosen.show_due(first.due + 0.25 / 30)
+    assert len(shown) == 2, "the frame that is due, and the pose after it"
+    expected = first.pose[0] + 0.25 * (second.pose[0] - first.pose[0])
+    np.testing.assert_allclose(shown[-1][0], expected, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(shown[-1][1], axis=-1), 1.0)
+    assert np.abs(shown[-1][1] - first.pose[1]).max() > 1e-6
+    np.testing.assert_allclose(show.chosen.position, (0.75 * chunk.root[0] + 0.25 * chunk.root[1])[::2], atol=1e-6)
+
+
 def test_a_drawn_path_is_walked_and_a_missing_one_is_named(show, actors, capsys):
     run(show, 1)
 

@@ -73,16 +73,16 @@ class Live:
 
 
 @contextmanager
-def open_page(url: str) -> Iterator[Any]:
+def open_page(url: str, **device: Any) -> Iterator[Any]:
     """The page in a browser that draws without a graphics card, once its characters move; no script of it may fail."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as drivers:
         browser = drivers.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
-        page, faults = browser.new_page(viewport=SIZE, accept_downloads=True), []
+        page, faults = browser.new_page(**{"viewport": SIZE, "accept_downloads": True} | device), []
         page.on("pageerror", lambda error: faults.append(str(error)))
         page.goto(url)
-        page.get_by_text(COUNTED).wait_for(timeout=60_000)
+        page.get_by_text(COUNTED).wait_for(timeout=60_000, state="attached")  # a phone's panel is folded
         yield page
         browser.close()
     assert faults == []
@@ -152,4 +152,28 @@ def test_a_walk_through_the_page(prior, tmp_path):
         page.get_by_text("The characters wait").wait_for(timeout=20_000)
         page.get_by_role("button", name="Back to live").click()
     assert not any("Traceback" in line or "went wrong" in line for line in show.lines), show.lines
+    assert show.end() == 0
+
+
+@pytest.mark.slow
+def test_a_phone_steers_by_touch(prior):
+    show = Live("--prior", prior)
+    with open_page(show.url, viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True) as page:
+        speed = page.get_by_text("Speed, m/s", exact=True)
+        speed.wait_for(state="hidden", timeout=20_000)
+        inside = "() => [...document.querySelectorAll('#mapctl-touch > *')].every((one) => {"
+        inside += "const r = one.getBoundingClientRect(); return r.left >= 0 && r.right <= 390 && r.bottom <= 844; })"
+        assert page.evaluate(inside)
+        page.locator("#mapctl-run").evaluate("one => one.click()")
+        stick = page.locator("#mapctl-move").bounding_box()
+        x, y = stick["x"] + stick["width"] / 2, stick["y"] + stick["height"] / 2
+        page.mouse.move(x, y)
+        page.mouse.down()
+        page.mouse.move(x + 50, y)
+        page.get_by_text("mapctl live").last.evaluate("one => one.click()")
+        speed.wait_for(timeout=20_000)
+        assert shows(page, "Speed, m/s", lambda value: value > 2)
+        assert shows(page, "Heading, degrees", bool)
+        page.mouse.up()
+        assert shows(page, "Speed, m/s", lambda value: value == 0)
     assert show.end() == 0

@@ -85,7 +85,7 @@ def on_its_bones(hero, frames: int = 30):
 
 def test_the_browser_draws_the_mesh_where_films_do(hero):
     scene = Scene()
-    body = SkinnedBody(scene, "/hero", hero)
+    body = SkinnedBody(scene, "/hero", hero.mesh, hero)
     motion = on_its_bones(hero)
     poses = body.prepare(motion)
     assert len(poses) == 30

@@ -131,11 +131,14 @@ class Deck:
     def __init__(self):
         self.heard: list[tuple] = []
         self.driving = Driving(
-            lambda speed, heading: self.heard.append(("steer", speed, heading)),
-            lambda action: self.heard.append(("act", action)),
-            lambda direction, viewer: 90.0 - math.degrees(math.atan2(*direction)),
+            steer=lambda *asked: self.heard.append(("steer", *asked)),
+            act=lambda action: self.heard.append(("act", action)),
+            find_heading=lambda direction, viewer: 90.0 - math.degrees(math.atan2(*direction)),
+            find_facing=lambda: next(self.facing),
+            find_lock=lambda: self.locked,
             fastest=3.8,
         )
+        self.facing, self.locked = iter((70.0, 75.0)), None
 
     def hold(self, *codes: str, page: int = 0, at: float | None = None) -> None:
         self.driving.update(page, PageState(keys=frozenset(codes)))
@@ -151,12 +154,12 @@ def deck() -> Deck:
 def test_a_held_key_walks_as_seen_from_the_camera_and_releasing_it_stands(deck):
     for k in range(30):
         deck.hold("KeyW", at=k / 60)
-    assert deck.heard == [("steer", 1.2, 90.0)], "the same is not sent again"
+    assert deck.heard == [("steer", 1.2, 90.0, None)], "the same is not sent again"
     deck.hold("KeyW", "ShiftLeft", "KeyA", at=1.0)
-    assert deck.heard[-1] == ("steer", pytest.approx(2.85), pytest.approx(135.0))
+    assert deck.heard[-1] == ("steer", pytest.approx(2.85), pytest.approx(135.0), None)
     deck.hold(at=1.01)
     deck.driving.step(1.02)
-    assert deck.heard[2:] == [("steer", 0.0, None)]
+    assert deck.heard[2:] == [("steer", 0.0, None, None)]
 
 
 def test_the_first_page_drives_until_it_releases_or_goes_away(deck):
@@ -164,10 +167,10 @@ def test_the_first_page_drives_until_it_releases_or_goes_away(deck):
     deck.hold("KeyS", page=1, at=0.2)
     assert len(deck.heard) == 1
     deck.hold(at=0.4)
-    assert deck.heard[-1] == ("steer", 1.2, pytest.approx(-90.0))
+    assert deck.heard[-1] == ("steer", 1.2, pytest.approx(-90.0), None)
     deck.driving.update(1, None)
     deck.driving.step(0.5)
-    assert deck.heard[-1] == ("steer", 0.0, None)
+    assert deck.heard[-1] == ("steer", 0.0, None, None)
 
 
 def test_single_keys_act_once(deck):
@@ -183,12 +186,40 @@ def test_a_stick_walks_with_its_push_a_trigger_runs_and_an_unplugged_gamepad_sta
         return deck.heard[-1:]
 
     assert push(0.0, 0.1, -0.1) == [], "sticks never rest at zero"
-    assert push(0.1, 0.0, -1.0) == [("steer", 1.2, pytest.approx(90.0))]
-    assert push(0.3, 0.0, -1.0, 1.0) == [("steer", pytest.approx(2.85), pytest.approx(90.0))]
-    assert push(0.5, 0.565, 0.0) == [("steer", pytest.approx(0.6), pytest.approx(0.0))]
+    assert push(0.1, 0.0, -1.0) == [("steer", 1.2, pytest.approx(90.0), None)]
+    assert push(0.3, 0.0, -1.0, 1.0) == [("steer", pytest.approx(2.85), pytest.approx(90.0), None)]
+    assert push(0.5, 0.565, 0.0) == [("steer", pytest.approx(0.6), pytest.approx(0.0), None)]
     deck.driving.update(0, PageState())
     deck.driving.step(0.7)
-    assert deck.heard[-1] == ("steer", 0.0, None)
+    assert deck.heard[-1] == ("steer", 0.0, None, None)
+
+
+def test_strafing_keeps_the_facing_and_so_does_standing_after_it(deck):
+    deck.hold("KeyQ", at=0.0)
+    deck.hold("KeyQ", at=0.2)
+    deck.hold("KeyE", "KeyW", at=0.4)
+    deck.hold(at=0.6)
+    deck.hold("KeyA", at=0.8)
+    assert deck.heard == [
+        ("steer", 1.2, pytest.approx(180.0), 70.0),
+        ("steer", 1.2, pytest.approx(45.0), 70.0),
+        ("steer", 0.0, None, 70.0),
+        ("steer", 1.2, pytest.approx(180.0), None),
+    ]
+
+
+def test_a_locked_facing_holds_in_all_directions_and_the_right_stick_goes_before_it(deck):
+    deck.locked = -30.0
+    deck.hold("KeyW", at=0.0)
+    deck.locked = -35.0
+    deck.driving.step(0.2)
+    assert deck.heard == [("steer", 1.2, 90.0, -30.0), ("steer", 1.2, 90.0, -35.0)]
+    deck.driving.update(0, PageState(keys={"KeyW"}, aim=(1.0, 0.0)))
+    deck.driving.step(0.4)
+    assert deck.heard[-1] == ("steer", 1.2, 90.0, pytest.approx(0.0))
+    deck.driving.update(0, PageState(aim=(0.0, 1.0)))
+    deck.driving.step(0.6)
+    assert deck.heard[-1] == ("steer", 0.0, None, pytest.approx(-90.0)), "it turns where it stands"
 
 
 def test_directions_add_up():
