@@ -15,10 +15,12 @@ from controllers.shots.reaching import STRETCHED_SHARE, MetPose, ReachTargets, m
 from controllers.shots.request import Look, PoseKey, Reach, ShotRequest
 from controllers.shots.trajectory import Trajectory
 from controllers.shots.walk import MOST_ACCELERATION
+from mapctl import contacts
 from mapctl.curves.obstacles import measure_clearance
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.effector_targets import compute_target_errors
 from mapctl.metrics.body import measure_accelerations, measure_worst
+from mapctl.metrics.gait import RUN_FLIGHT, find_gait, measure_flight
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, FEET, LIMBS, TOES
 
@@ -113,6 +115,10 @@ def check_constraints(
         apart = 100 * float((hips[None] - request.others.at(torch.arange(len(hips)))).norm(dim=-1).amin())
         asked = f"{request.others.distance:g} m"
         found.append(Constraint("keep apart", asked, apart, 100 * request.others.distance - 1.0, "cm", at_least=True))
+    if (gait := find_gait(request.labels)) is not None:
+        flight = 100 * measure_flight(contacts.detect_contacts(positions[:, CANONICAL.indices(TOES)], PRIOR_FPS))
+        asked, runs = ("no foot on the ground at times", True) if gait == "run" else ("a foot on the ground", False)
+        found.append(Constraint(f"gait {gait}", asked, flight, 100 * RUN_FLIGHT, "% in flight", at_least=runs))
     speeds, last = 100 * torch.diff(hips, dim=0).norm(dim=-1) * PRIOR_FPS, (motion.num_frames - 1) / PRIOR_FPS
     ends = {"start": (request.stand_at_start, slice(_STILL_AT_START), (0.0, _STILL_AT_START / PRIOR_FPS))}
     ends["end"] = (request.stand_at_end, slice(-_STILL_AT_END, None), (last - _STILL_AT_END / PRIOR_FPS, last))

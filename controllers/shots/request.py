@@ -290,6 +290,8 @@ class ShotRequest:
     """Obstacles to walk around."""
     others: Others | None = None
     """Others to keep apart from."""
+    labels: tuple[str, ...] = ()
+    """Labels on which the prior is conditioned; the gait that they name is measured."""
 
     @cached_property
     def walks_only(self) -> bool:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
 from itertools import pairwise
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -24,7 +24,8 @@ from controllers.steering.steer import Refusal, SteerFrames, SteerState, Stepper
 from mapctl.arguments import read_number
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
-from mapctl.intent.steering import Command, SteeringTarget
+from mapctl.intent.steering import Command, CommandTrack, SteeringTarget
+from mapctl.metrics.travel import list_misses, measure_arrivals, measure_commands
 from mapctl.motion import Motion
 from mapctl.problem.solution import Ledger
 from mapctl.rotations import make_sign_continuous
@@ -137,6 +138,18 @@ class Recorder:
     def refusals(self) -> list[Refusal]:
         """Orders that were not obeyed."""
         return [piece.refusal for piece in self.pieces if piece.refusal is not None]
+
+    def judge(self, track: CommandTrack, frames: int | None = None) -> dict[str, list[Any]]:
+        """Judge all that was shown, or the first so many frames, by the commands under which it was steered.
+
+        Keys: `commands` and `arrivals`, rows of `mapctl.metrics.travel`, and `misses`, a sentence with numbers for each
+        field that was not obeyed.
+        """
+        motion, refusals = self.motion(frames), self.refusals
+        commands = measure_commands(motion, track)
+        arrivals = measure_arrivals(motion, track, [refusal.order for refusal in refusals])
+        misses = [*(refusal.reason for refusal in refusals), *list_misses(commands, arrivals)]
+        return {"commands": commands, "arrivals": arrivals, "misses": misses}
 
     @property
     def steering_targets(self) -> list[SteeringTarget]:

@@ -34,7 +34,6 @@ from mapctl.curves.obstacles import Obstacle, measure_clearance
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.steering import CommandTrack, SteeringLimits, read_commands
-from mapctl.metrics.travel import measure_arrivals, measure_commands
 from mapctl.motion import join_licences
 from mapctl.problem.solution import Outcome, Solution, Status
 from mapctl.terms import FootContact
@@ -84,13 +83,27 @@ class Steer(ModelCommand, options.ReadOptions, streaming.StreamOptions):
     report: options.MaybeFile = None
     """JSON with each command's response, timing, ledger and measures."""
     strict: bool = False
-    """Exit with status 3 where not all that was requested holds: a speed was lowered to what the prior can do, or a
-    frame was late."""
+    """Exit with status 3 where not all that was requested holds: something of a command was not obeyed, a speed was
+    lowered to what the prior can do, or a frame was late."""
     quiet: bool = False
     """No summary and no progress bar."""
 
 
-_HAND_WORDS = {"leftHand": "left hand", "rightHand": "right hand"}
+_DETAILS = {
+    "steady_speed_mps": "then {:.2f} m/s",
+    "steady_heading_error_deg": "{:+.1f} degrees off",
+    "steady_facing_error_deg": "facing {:+.1f} degrees off",
+    "steady_turn_deg_s": "turning {:.0f} degrees/s",
+    "steady_step_m": "steps of {:.2f} m",
+    "look_nearest_deg": "head {:.0f} degrees off what it looks at",
+    "leftHand_nearest_cm": "left hand {:.0f} cm off",
+    "leftHand_held_s": "there for {:.1f} s",
+    "rightHand_nearest_cm": "right hand {:.0f} cm off",
+    "rightHand_held_s": "there for {:.1f} s",
+    "position_error_cm": "{:.2f} cm off",
+    "facing_error_deg": "{:.2f} degrees off",
+    "pose_error_cm": "joints {:.1f} cm off the pose",
+}
 _AFTER_SECONDS = 1.0  # for which a motion goes on after the last position was reached
 _LAST_COMMAND_SECONDS = 3.0  # seconds for which a script of a single command is played
 
@@ -128,7 +141,8 @@ def run(command: Steer) -> int:
     if stream is not None:
         timing["stream"] = asdict(stream.statistics)
     late, sent_late = timing["late_frames"], timing.get("stream", {}).get("late", 0)
-    notes = [*lowered, *(refusal.reason for refusal in recorder.refusals)]
+    judged = recorder.judge(track, frames)
+    notes = [*lowered, *judged["misses"]]
     notes += [f"{late} frames came after they were due"] if late else []
     notes += [f"{sent_late} frames were sent late"] if sent_late else []
     outcome = Outcome.INTERRUPTED if motion.num_frames < frames else Outcome.DONE
@@ -142,8 +156,7 @@ def run(command: Steer) -> int:
         prior={"name": prior.name, "licence": prior.card.licence, "quality": prior.card.quality},
         timing=timing,
     )
-    arrivals = measure_arrivals(motion, track, [refusal.order for refusal in recorder.refusals])
-    found |= {"commands": measure_commands(motion, track)} | ({"arrivals": arrivals} if arrivals else {})
+    found |= judged
     if command.report is not None:
         report.write_report(outputs.add_licence(found), command.report)
     if not command.quiet:
@@ -214,42 +227,26 @@ def _stream_to(stream: "PoseStream", clock: WallClock, frames: int, zero: float)
     return show
 
 
-def _format_position(row: Mapping[str, Any], name: str, words: str) -> str:
-    """Format how near a hand came to its target, and for how long it was there; empty without a target."""
-    nearest = row.get(f"{name}_nearest_cm")
-    if nearest is None:
-        return ""
-    held = row[f"{name}_held_s"]
-    return f", {words} there for {held:.1f} s" if held else f", {words} {nearest:.0f} cm short"
+def _format_command(row: Mapping[str, Any]) -> str:
+    """Format what was commanded and what came of it."""
+    speed, heading, facing, turn = (row[key] for key in ("speed_mps", "heading_deg", "facing_deg", "turn_deg_s"))
+    direction = f" to {heading:.0f} degrees" if turn is None else f" turning {turn:.0f} degrees/s"
+    asked = f"{speed:.2f} m/s{direction}" if speed else "stand"
+    asked += f" facing {facing:.0f} degrees" if facing is not None and (not speed or facing != heading) else ""
+    reached = "not reached" if row["reached_s"] is None else f"reached after {row['reached_s']:.1f} s"
+    return f"{row['time_s']:6.1f} s  {asked}: {', '.join([reached, *_format_details(row)])}"
 
 
-def _format_arrival(row: Mapping[str, Any]) -> str:
-    """Format how near a position was reached, and the errors of facing and pose where they were given."""
-    facing, pose = row["facing_error_deg"], row["pose_error_cm"]
-    turned = "" if facing is None else f", {facing:.2f} degrees off"
-    posed = "" if pose is None else f", joints {pose:.1f} cm off the pose"
-    where = f"{row['goto_x_m']:g}, {row['goto_z_m']:g} m"
-    return f"{row['by_s']:6.1f} s  at {where}: {row['position_error_cm']:.2f} cm off{turned}{posed}"
+def _format_details(row: Mapping[str, Any]) -> list[str]:
+    return [text.format(row[key]) for key, text in _DETAILS.items() if row.get(key) is not None]
 
 
 def _format_summary(found: Mapping[str, Any], files: Sequence[Path], streamed: str | None) -> list[str]:
-    lines = []
-    for row in found["commands"][:-1]:
-        reached = "not reached" if row["reached_s"] is None else f"reached after {row['reached_s']:.1f} s"
-        steady = "" if row["steady_speed_mps"] is None else f", then {row['steady_speed_mps']:.2f} m/s"
-        off, rate = row["steady_heading_error_deg"], row["steady_turn_deg_s"]
-        turned = "" if off is None else f", {off:+.1f} degrees off"
-        turned += "" if rate is None else f", turning {rate:.0f} degrees/s"
-        turned += "" if row["steady_step_m"] is None else f", steps of {row['steady_step_m']:.2f} m"
-        looked = row.get("look_nearest_deg")
-        details = "" if looked is None else f", head {looked:.0f} degrees off what it looks at"
-        details += "".join(_format_position(row, name, words) for name, words in _HAND_WORDS.items())
-        turn = row["turn_deg_s"]
-        direction = f"to {row['heading_deg']:.0f} degrees" if turn is None else f"turning {turn:.0f} degrees/s"
-        lines.append(
-            f"{row['time_s']:6.1f} s  {row['speed_mps']:.2f} m/s {direction}: {reached}{steady}{turned}{details}"
-        )
-    lines += [_format_arrival(row) for row in found.get("arrivals", ())]
+    commands = found["commands"]
+    lines = [_format_command(row) for row in (commands[:-1] or commands)]
+    for row in found["arrivals"]:
+        where = f"{row['goto_x_m']:g}, {row['goto_z_m']:g} m"
+        lines.append(f"{row['by_s']:6.1f} s  at {where}: {', '.join(_format_details(row))}")
     cost, latency = found["timing"], found["timing"]["command_latency_s"]
     waited = "" if latency is None else f"; a command waits {latency:.2f} s at most"
     slow = f"; too slow here: time stood still for {cost['held_s']:.1f} s" if cost["held_s"] else ""

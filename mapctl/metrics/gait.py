@@ -1,5 +1,6 @@
 """Paces, and changes of pace: starts, stops, and changes between a walk and a run, by the hips' smoothed speed."""
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -66,6 +67,22 @@ def follow_pace(speed: Float[ndarray, " frames"]) -> Int[ndarray, " frames"]:
 def find_pace(speed: float) -> str:
     """Find the pace of a mean speed, m/s, halfway between the bounds of changes."""
     return PACES[(speed > (STANDS + GOES) / 2) + (speed > (WALKS + RUNS) / 2)]
+
+
+RUN_FLIGHT = 0.1
+"""Share of the time without a planted toe above which a gait is a run: captured runs have 0.14 to 0.68, walks up to
+0.06."""
+
+
+def find_gait(labels: Sequence[str]) -> str | None:
+    """Return the gait that labels of a density name (`run`, `gait=walk-turn-left`): run or walk; None for neither."""
+    words = [label.split("=")[-1].split("-")[0] for label in labels]
+    return next((word for word in words if word in PACES[1:]), None)
+
+
+def measure_flight(planted: Bool[Tensor, "frames feet"]) -> float:
+    """Measure the share of frames in which no toe is planted."""
+    return float((~planted.any(dim=-1)).float().mean())
 
 
 def _follow(speed: Float[ndarray, " frames"], low: float, high: float) -> Bool[ndarray, " frames"]:

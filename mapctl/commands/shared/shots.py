@@ -122,6 +122,7 @@ def plan_shot(
             looks.append(Look(at, key.look_at, key.hold_seconds))
         if key.gives_hips:
             poses.append(_build_pose_key(key, at, within, read))
+    labels = tuple(f"{group}={value}" for group, value in (("gait", actor.gait), ("style", actor.style)) if value)
     request = ShotRequest(
         curve,
         _read_speed(actor, curve),
@@ -144,8 +145,8 @@ def plan_shot(
             for step in actor.footsteps
         ),
         obstacles=tuple(obstacles),
+        labels=labels,
     )
-    labels = [f"{group}={value}" for group, value in (("gait", actor.gait), ("style", actor.style)) if value]
     return ShotPlan(actor, request, prior.conditioned_on(labels) if labels else prior, character, rate, note)
 
 
