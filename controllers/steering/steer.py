@@ -112,8 +112,9 @@ class SteerSettings:
     """Frames of a window, the look-ahead included."""
     commit: int = 3
     """Frames that a step commits and delivers."""
-    evaluations: int = 14
-    """Most evaluations of energy and gradient in a step: what one core computes while three frames are shown."""
+    evaluations: int = 8
+    """Most evaluations of energy and gradient in a step. With 14, commands are reached no sooner, and planted toes move
+    more (`tests/benchmarks/steer.py`)."""
     least_evaluations: int = 6
     """Evaluations for which the loop gives a step time, however late it is: with fewer, targets are missed
     (docs/reference/results.md). Never more than `evaluations`."""

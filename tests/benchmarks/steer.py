@@ -112,8 +112,8 @@ def judge(name: str, motion: Motion, track: CommandTrack, kinds: Sequence[str], 
     rows = [summarise(f"{kind}, {name}", found[kind]) for kind in SHARES if kind in found]
     frames = round(track.times[-1] * PRIOR_FPS)
     whole = {**summarise(f"all, {name}", obeyed), **average_gait([measure(motion.slice(0, frames))])}
-    if stand:
-        whole |= measure_stand(motion.slice(frames, motion.num_frames))
+    if stand:  # from two seconds on
+        whole |= measure_stand(motion.slice(frames + round(2 * PRIOR_FPS), motion.num_frames))
     return [*rows, whole]
 
 
