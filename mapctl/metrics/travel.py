@@ -48,7 +48,7 @@ def measure_commands(motion: Motion, track: CommandTrack) -> list[dict[str, Any]
     Keys: time_s, speed_mps, heading_deg, turn_deg_s (wanted; None unless it is to turn on and on), reached_s (None if
     it never was), steady_speed_mps (net displacement over time; mean speed while turning), steady_heading_error_deg and
     steady_turn_deg_s (None where the other or standing was wanted), facing_deg (wanted, the direction of travel unless
-    another was given; None for that of one who turns on and on) and steady_facing_error_deg, step_m and steady_step_m
+    another was given; None where it turns on and on without one) and steady_facing_error_deg, step_m and steady_step_m
     (None unless a step length was wanted), gait (run or walk, where a label names it) and steady_flight_share, of the
     time without a planted toe. For each hand with a position: `<hand>_nearest_cm`, and `<hand>_held_s`, the seconds in
     which it was within a centimetre of it, over all commands with this position; `look_nearest_deg`, the least angle
