@@ -25,6 +25,7 @@ def delivered(first: int = 0, count: int = 3, *, spare: float = 0.02) -> FrameCh
         np.tile([1.0, 0.0], (count, 1)),
         motion.joint_positions().numpy(),
         (0.0, 1.2),
+        0.5,
         spare,
         0.05,
         np.zeros((count, 2)),

@@ -215,6 +215,7 @@ class ProcessClock(WallClock):
             frames.contacts.numpy(),
             frames.forecast.numpy(),
             frames.steering_targets[-1].velocity,
+            frames.steering_targets[-1].facing,
             spare,
             frames.seconds,
             frames.root_velocity.numpy(),

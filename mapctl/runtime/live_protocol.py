@@ -33,6 +33,8 @@ class FrameChunk:
     """World joint positions of the forecast frames, metres."""
     target_velocity: tuple[float, float]
     """Target velocity of the last frame, x and z, m/s."""
+    target_facing: float
+    """Target facing of the hips in the last frame, radians from +Z toward +X."""
     spare: float
     """Lateness, seconds from when the first frame was due to its delivery; negative where it came early. Frames that
     came very late are due anew, as soon as they are there."""

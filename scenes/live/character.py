@@ -1,5 +1,6 @@
 """One character of the live viewer: its process, its body and marks, its past."""
 
+import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -268,7 +269,7 @@ class ShownCharacter:
         return chunks
 
     def describe_status(self) -> str:
-        """Describe speed, cost and lateness; why it has ended, and whether this machine is too slow for it."""
+        """Describe speed, facing, cost and lateness; why it has ended, and whether this machine is too slow for it."""
         if self.ended:
             return f"⚠️ {self.name} has ended: {self.ended}. Reset restarts it."
         if len(self.past) < 2:
@@ -276,10 +277,11 @@ class ShownCharacter:
         recent = np.array([one.chunk.root[one.frame, ::2] for one in self.past[-_SPEED_FRAMES:]])
         speed = float(np.linalg.norm(recent[-1] - recent[0])) * PRIOR_FPS / (len(recent) - 1)
         chunk = self.past[-1].chunk
+        off = math.degrees(math.remainder(facing_of(chunk.quats[-1, 0]) - chunk.target_facing, 2 * math.pi))
         is_slow = self.frames > PRIOR_FPS / 2 and 2 * self.late_frames >= self.frames
         warning = "  \n⚠️ This machine is too slow." if is_slow else ""
         return (
-            f"**{speed:.2f} m/s**, target {np.hypot(*chunk.target_velocity):.2f}  \n"
+            f"**{speed:.2f} m/s**, target {np.hypot(*chunk.target_velocity):.2f}; facing {abs(off):.0f}° off  \n"
             f"{1000 * chunk.compute_seconds / len(chunk.root):.1f} ms a frame · "
             f"{self.late_frames} of {self.frames} frames late{warning}"
         )

@@ -25,6 +25,9 @@ def keys(tmp_path):
     return path
 
 
+QUALITIES = "feet", "soles", "support", "ground", "acceleration"  # of any motion
+
+
 @pytest.mark.slow
 def test_follow_starts_and_ends_standing_and_reports_every_constraint(keys, tmp_path, capsys):
     out, report = tmp_path / "a.bvh", tmp_path / "a.json"
@@ -50,7 +53,7 @@ def test_follow_starts_and_ends_standing_and_reports_every_constraint(keys, tmp_
     assert set(motion.skeleton.names) == set(CANONICAL.names)
     found = json.loads(report.read_text())
     names = {constraint["constraint"].split(" at")[0] for constraint in found["constraints"]}
-    assert names == {"path", "progress", "obstacles", "look", "stand"}
+    assert names == {"path", "progress", "obstacles", "look", "stand", "gait walk", *QUALITIES}
     assert all(
         {"asked", "got", "residual", "unit", "holds"} <= constraint.keys() for constraint in found["constraints"]
     )
@@ -76,6 +79,7 @@ def test_a_scene_goes_on_from_a_clip_on_its_rig_and_keeps_apart(tmp_path):
         "progress",
         "obstacles",
         "keep apart",
+        *QUALITIES,
     ]
 
 

@@ -1,6 +1,7 @@
 """The live viewer without a browser: what users do reaches the characters, errors end nothing, the past is shown."""
 
 import math
+import re
 import socket
 
 import numpy as np
@@ -85,6 +86,7 @@ def test_frames_are_shown_where_they_say_and_the_world_moves_past_the_camera(sho
     assert position.tolist() in chunk.root[:, ::2].tolist()
     assert np.dot(show.view._world.position[[0, 2]], position) < 0
     assert "frames late" in show.chosen.describe_status()
+    assert re.search(r"facing (2[6-9]|3[01])° off", show.chosen.describe_status())  # of 0.5 radians
     show.view.chase.mode = CameraMode.FREE
     before = np.array(show.view._world.position)
     run(show, 5)
