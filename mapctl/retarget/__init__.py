@@ -16,7 +16,7 @@ from torch import Tensor
 from mapctl import formats, kinematics, rotations
 from mapctl.errors import RequestError
 from mapctl.formats.character import CharacterSource
-from mapctl.formats.examples import is_example
+from mapctl.kinematics.moving import rotate_world
 from mapctl.motion import Motion
 from mapctl.retarget.anatomy import RigPoses, goes_on_four_legs
 from mapctl.retarget.joint_matching import Match, correct_sides, match
@@ -32,7 +32,6 @@ class RigMap(TPose):
     rig: Rig
     """The rig's names and T-pose."""
     rig_skeleton: Skeleton
-    """The rig's own skeleton."""
     joint_of: tuple[int | None, ...]
     """For each canonical joint the rig's joint, None where the rig has only an End Site or nothing."""
     skeleton: Skeleton
@@ -66,7 +65,7 @@ def load_rig(name_or_path: str | PathLike[str]) -> Rig:
             return rig
     if path.suffix.lower() == ".toml":
         return read_rig_toml(path)
-    if not path.suffix and not is_example(path):
+    if not path.suffix and not formats.is_example(path):
         names = ", ".join(rig.name for rig in known_rigs())
         raise RequestError(f"no rig {text!r}; known rigs: {names}; or name a TOML file or a clip")
     found = to_canonical(formats.load(path))[1]
@@ -242,12 +241,3 @@ def put_upright(motion: Motion, rig: Rig | None = None) -> tuple[Motion, tuple[s
         return rotate_world(motion, identify_rig(motion.skeleton, rig, motion=motion).upright_quat_xyzw), ()
     except RequestError:
         return motion, (UNKNOWN_RIG_NOTE,)
-
-
-def rotate_world(motion: Motion, turn: Float[Tensor, "4"] | None) -> Motion:
-    """Rotate the world of a motion (xyzw); None for no rotation."""
-    if turn is None:
-        return motion
-    every, local = turn.expand(motion.num_frames, 4), motion.local_quat_xyzw.clone()
-    local[:, 0] = rotations.multiply(every, local[:, 0])
-    return replace(motion, root_position=rotations.rotate(every, motion.root_position), local_quat_xyzw=local)
