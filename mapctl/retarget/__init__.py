@@ -147,7 +147,7 @@ def to_canonical(motion: Motion, rig: Rig | RigMap | None = None) -> tuple[Motio
         if joint is None:  # an End Site rotates with its parent
             picked.append(picked[CANONICAL.parents[CANONICAL.index(name)]])
         else:
-            picked.append(rotations.multiply(world[:, joint], rotations.inverse(tpose).expand(len(world), 4)))
+            picked.append(rotations.multiply(world[:, joint], rotations.inverse(tpose)))
     local = kinematics.local_from_world(CANONICAL.parents, torch.stack(picked, dim=1))
     hips = motion.joint_positions()[:, rigmap.joints["hips"]]
     found = Motion(rigmap.skeleton, motion.fps, hips, local, licence=motion.licence)
@@ -180,10 +180,10 @@ def from_canonical(motion: Motion, rigmap: RigMap, original: Motion | None = Non
     targets, hips = motion.joint_rotations(), motion.root_position
     if rigmap.upright_quat_xyzw is not None:  # back to the file's world
         back = rotations.inverse(rigmap.upright_quat_xyzw)
-        targets = rotations.multiply(back.expand(targets.shape), targets)
+        targets = rotations.multiply(back, targets)
         hips = rotations.rotate(back.expand(frames, 4), hips)
     pairs = enumerate(zip(rigmap.joint_of, rigmap.tpose_quat_xyzw, strict=True))
-    wanted = {j: rotations.multiply(targets[:, c], b.expand(frames, 4)) for c, (j, b) in pairs if j is not None}
+    wanted = {j: rotations.multiply(targets[:, c], b) for c, (j, b) in pairs if j is not None}
     local, world = [], []
     for joint, parent in enumerate(skeleton.parents):
         above = world[parent] if parent >= 0 else None
