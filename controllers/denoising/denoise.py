@@ -46,6 +46,7 @@ from mapctl.recording.inspection import (
     Artefact,
     Inspection,
     estimate_lead_shares,
+    exchange_swapped_limbs,
     hold_rigid_bones,
     inspect_recording,
     list_artefacts,
@@ -61,7 +62,6 @@ from mapctl.recording.masks import (
     write_back_masked,
 )
 from mapctl.recording.noise_estimation import choose_continuous_signs, estimate_angle_noise, estimate_position_noise
-from mapctl.recording.swaps import exchange_swapped_limbs
 from mapctl.retarget import RigMap, as_rig, from_canonical, identify_rig, to_canonical
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL, TOES, leg_length

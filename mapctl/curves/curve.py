@@ -44,9 +44,11 @@ def build_dense_polyline(
     distinct = given[np.r_[True, _span_lengths(given) > _COINCIDENT]]
     if len(distinct) < 2:
         raise RequestError("a curve needs at least 2 distinct points, got 1")
-    closed = _ends_meet(distinct) if closed is None else closed
-    if closed:
-        distinct = _close_polyline(distinct)
+    gap = np.linalg.norm(distinct[-1] - distinct[0])
+    if closed is None:
+        closed = len(distinct) > 2 and bool(gap <= max(_CLOSED_GAP, 0.5 * np.median(_span_lengths(distinct))))
+    if closed:  # the first point again, exactly
+        distinct = np.concatenate([distinct[:-1] if gap <= _CLOSED_GAP else distinct, distinct[:1]])
     length = _span_lengths(distinct).sum()
     if not MIN_LENGTH <= length <= MAX_LENGTH:
         raise RequestError(f"the curve is {length:.6g} m long, allowed are {MIN_LENGTH:g} to {MAX_LENGTH:g} m")
@@ -70,18 +72,6 @@ def _check_points(points: ndarray | Tensor) -> Float[ndarray, "points dims"]:
 
 def _span_lengths(points: ndarray) -> ndarray:
     return np.linalg.norm(np.diff(points, axis=0), axis=1)
-
-
-def _ends_meet(points: ndarray) -> bool:
-    gap = np.linalg.norm(points[-1] - points[0])
-    return len(points) > 2 and bool(gap <= max(_CLOSED_GAP, 0.5 * np.median(_span_lengths(points))))
-
-
-def _close_polyline(points: ndarray) -> ndarray:
-    """Repeat the first point at the end, exactly."""
-    if np.linalg.norm(points[-1] - points[0]) <= _CLOSED_GAP:
-        points = points[:-1]
-    return np.concatenate([points, points[:1]])
 
 
 def _thin_points(points: ndarray, spacing: float) -> ndarray:

@@ -101,7 +101,8 @@ def _find_best_arcs(
     cost = grid.squared_distances(positions[0], first, stop)
     cameby: list[tuple[int, ndarray]] = []
     for position in positions[1:]:
-        first, stop, cost = _prune_arcs(first, cost)
+        alive = np.flatnonzero(cost <= cost.min() + _PRUNING_MARGIN)  # arcs that may still turn out best
+        first, stop, cost = first + int(alive[0]), first + int(alive[-1]) + 1, cost[alive[0] : alive[-1] + 1]
         low, high = grid.within(first - most, stop + most)
         padded = np.pad(cost, 2 * most, constant_values=np.inf)[low - first + most : high - first + 3 * most]
         around = np.lib.stride_tricks.sliding_window_view(padded, 2 * most + 1)[:, ::-1] + price
@@ -116,21 +117,12 @@ def _find_best_arcs(
     return np.array(found[::-1], dtype=float)
 
 
-def _prune_arcs(first: int, cost: Float[ndarray, " arcs"]) -> tuple[int, int, Float[ndarray, " fewer"]]:
-    """Narrow the range to the arcs that may still turn out best."""
-    alive = np.flatnonzero(cost <= cost.min() + _PRUNING_MARGIN)
-    low, high = int(alive[0]), int(alive[-1]) + 1
-    return first + low, first + high, cost[low:high]
-
-
 def _refine_arcs(
     curve: Curve, points: Float[Tensor, "frames dims"], arcs: Float[Tensor, " frames"], reach: float
 ) -> Float[Tensor, " frames"]:
     """Find the nearest arcs on the branch that was found."""
-    room = (
-        torch.arange(-math.ceil(reach / _REFINED_STEP), math.ceil(reach / _REFINED_STEP) + 1, dtype=torch.float64)
-        * _REFINED_STEP
-    )
+    count = math.ceil(reach / _REFINED_STEP)
+    room = torch.arange(-count, count + 1, dtype=torch.float64) * _REFINED_STEP
     found = []
     for some, around in zip(points.split(4096), arcs.split(4096), strict=True):  # keeps memory small
         tried = around[:, None] + room

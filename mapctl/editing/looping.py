@@ -345,7 +345,7 @@ def _carry_root(rigged: RiggedMotion, cycle: Cycle, travel: GroundTransform, fir
     turns, shifts = travel.share((torch.arange(first, last) - cycle.start).double() / cycle.frames)
     start, turn = rigged.motion.root_position[cycle.start], rigged.motion.local_quat_xyzw[cycle.start, 0]
     position = rotations.rotate_about_y(start.expand(len(turns), 3), turns) + rotations.lift_ground(shifts)
-    turned = rotations.multiply(rotations.about_y(turns), turn.expand(len(turns), 4))
+    turned = rotations.multiply(rotations.about_y(turns), turn)
     return set_root_track(window, position, turned, [child])
 
 

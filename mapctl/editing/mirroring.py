@@ -95,8 +95,8 @@ def _mirror_joints(rigged: RiggedMotion) -> Motion:
     motion, partners, rest = rigged.motion, pair_joints(rigged.rigmap), rigged.rigmap.rest_quat_xyzw
     world = motion.joint_rotations()
     index = torch.tensor([joint if partner is None else partner for joint, partner in enumerate(partners)])
-    swung = rotations.multiply(world[:, index], rotations.inverse(rest[index]).expand(world.shape))
-    turned = rotations.multiply(swung * _FLIP_XYZW, rest.expand(world.shape))
+    swung = rotations.multiply(world[:, index], rotations.inverse(rest[index]))
+    turned = rotations.multiply(swung * _FLIP_XYZW, rest)
     local = kinematics.local_from_world(motion.skeleton.parents, turned)
     alone = [joint for joint, partner in enumerate(partners) if partner is None]
     local[:, alone] = motion.local_quat_xyzw[:, alone]

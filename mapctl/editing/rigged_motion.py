@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl import retarget, rotations
+from mapctl.kinematics.moving import rotate_world
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
 from mapctl.retarget import RigMap
@@ -37,7 +38,7 @@ class RiggedMotion:
     def of(motion: Motion, rig: Rig | None = None) -> "RiggedMotion":
         """Identify the rig and put the motion upright; RequestError where the rig's joints cannot be identified."""
         rigmap = retarget.identify_rig(motion.skeleton, rig, motion=motion)
-        return RiggedMotion(retarget.rotate_world(motion, rigmap.upright_quat_xyzw), rigmap)
+        return RiggedMotion(rotate_world(motion, rigmap.upright_quat_xyzw), rigmap)
 
     def with_motion(self, motion: Motion) -> "RiggedMotion":
         """Return another upright motion of the same rig."""
@@ -45,12 +46,10 @@ class RiggedMotion:
 
     @property
     def hips(self) -> int:
-        """Index of the rig's hips."""
         return self.rigmap.joints["hips"]
 
     @cached_property
     def canonical(self) -> Motion:
-        """The motion on canonical joints."""
         return retarget.to_canonical(self.motion, replace(retarget.as_rig(self.rigmap), up="y"))[0]
 
     def positions(self, part: str) -> Float[Tensor, "frames 2 3"]:
@@ -67,7 +66,7 @@ class RiggedMotion:
             return self.motion.joint_positions()[:, joint]
         index = CANONICAL.index(name)
         parent = CANONICAL.parents[index]
-        bone = self.canonical.skeleton.offsets[index].expand(self.motion.num_frames, 3)
+        bone = self.canonical.skeleton.offsets[index]
         turned = rotations.rotate(self.canonical.joint_rotations()[:, parent], bone)
         return self.position(CANONICAL.names[parent]) + turned
 
@@ -83,7 +82,7 @@ class RiggedMotion:
     def in_file_world(self, like: Motion | None = None) -> Motion:
         """Return the motion in the world of its file. What is as in `like`, but for rounding, has its numbers."""
         up = self.rigmap.upright_quat_xyzw
-        motion = retarget.rotate_world(self.motion, None if up is None else rotations.inverse(up))
+        motion = rotate_world(self.motion, None if up is None else rotations.inverse(up))
         if like is None:
             return motion
 
@@ -130,8 +129,8 @@ def _place_ankle(rigged: RiggedMotion, side: str, target: Float[Tensor, "frames 
     at, knee, ankle = (positions[:, joint] for joint in joints)
     # The direction in the world in which the knee of a straight leg would bend.
     rest = rigged.rigmap.tpose_quat_xyzw[CANONICAL.index(side + "UpperLeg")]
-    swung = rotations.multiply(world[:, joints[0]], rotations.inverse(rest).expand(len(world), 4))
-    forward = rotations.rotate(swung, swung.new_tensor([0.0, 0.0, 1.0]).expand(len(swung), 3))
+    swung = rotations.multiply(world[:, joints[0]], rotations.inverse(rest))
+    forward = rotations.rotate(swung, swung.new_tensor([0.0, 0.0, 1.0]))
     thigh_turn, shin_turn = _turn_leg(knee - at, ankle - knee, target - at, forward)
     parents = [rigged.motion.skeleton.parents[joint] for joint in joints]
     # What carries each joint has turned as the bone above it did, helper joints between the two included.

@@ -60,8 +60,7 @@ class GroundTransform:
 
 
 def move_by_share(motion: Motion, transform: GroundTransform, shares: Float[Tensor, " frames"]) -> Motion:
-    """Move each frame of a motion with Y up by a share of a transform: turned about the vertical through the origin,
-    then shifted."""
+    """Move each frame of a motion with Y up by a share of a transform: first turned about the origin, then shifted."""
     turns, shifts = transform.share(shares)
     local = motion.local_quat_xyzw.clone()
     local[:, 0] = rotations.multiply(rotations.about_y(turns), local[:, 0])
@@ -72,13 +71,7 @@ def move_by_share(motion: Motion, transform: GroundTransform, shares: Float[Tens
 def repeat_over_ground(motion: Motion, transform: GroundTransform, times: int) -> Motion:
     """Repeat a motion with Y up, each time moved on by the transform; the first one stays."""
     rounds = torch.arange(times, dtype=torch.float64).repeat_interleave(motion.num_frames)
-    tiled = replace(
-        motion,
-        root_position=motion.root_position.repeat(times, 1),
-        local_quat_xyzw=motion.local_quat_xyzw.repeat(times, 1, 1),
-        moving_offsets={joint: track.repeat(times, 1) for joint, track in motion.moving_offsets.items()},
-    )
-    return move_by_share(tiled, transform, rounds)
+    return move_by_share(motion.pick(torch.arange(motion.num_frames).repeat(times)), transform, rounds)
 
 
 def fit_ground_transform(
@@ -167,7 +160,7 @@ def move_travel_to_root(motion: Motion, rig: Rig | None = None, cycle: GroundTra
     if rigged.hips == 0:
         up = rigged.rigmap.upright_quat_xyzw
         rooted, like, rest = add_root(rooted), add_root(motion), UNROTATED if up is None else up
-    turn = rotations.multiply(rotations.about_y(heading), rest.expand(motion.num_frames, 4))
+    turn = rotations.multiply(rotations.about_y(heading), rest)
     put = set_root_track(rooted, rotations.lift_ground(position), turn, rooted.skeleton.children(0))
     return rigged.with_motion(put).in_file_world(like)
 

@@ -91,11 +91,9 @@ class AsfSkeleton:
     length: float
     """`length` of :units: so many units to the inch; 1 is no information."""
     degrees: bool
-    """Whether angles are in degrees."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the bones."""
         return tuple(bone.name for bone in self.bones)
 
     def columns(self, kind: str) -> list[tuple[tuple[int, ...], list[int]]]:
@@ -123,7 +121,7 @@ def read(
         subject, take = find_paths(path)
     except OSError as error:  # as a name that is too long, or a folder that may not be listed
         raise FileFormatError(path, f"cannot be read: {error.strerror or error}") from error
-    asf = read_asf(subject)
+    asf = _AsfReader(subject).read(decode(subject, read_bytes(subject), "ASF text")[0])
     values, degrees, own_fps = read_amc(take, asf, lossy=lossy)
     check_extent(take, len(values), len(asf.bones))
     lost = np.isnan(values)
@@ -198,11 +196,6 @@ def _quaternions(asf: AsfSkeleton, values: np.ndarray, *, degrees: bool) -> Floa
     return rotations.make_sign_continuous(about)
 
 
-def read_asf(path: str | PathLike[str]) -> AsfSkeleton:
-    """Read an ASF file. FileFormatError names the line and what was expected there."""
-    return _AsfReader(path).read(decode(path, read_bytes(path), "ASF text")[0])
-
-
 def rows(text: str) -> Iterator[Row]:
     """Return the lines of ASF or AMC text that hold words, without comments; commas and brackets are blanks."""
     for number, line in enumerate(text.split("\n"), start=1):
@@ -214,6 +207,8 @@ _BLANKS = str.maketrans(",()", "   ")
 
 
 class _AsfReader:
+    """Reader of an ASF file. FileFormatError names the line and what was expected there."""
+
     def __init__(self, path: str | PathLike[str]):
         self.path = path
         self.degrees, self.length = True, 1.0

@@ -101,8 +101,7 @@ def _permissions(path: Path) -> int:
 
 
 def _set_permissions(scratch: Path, mode: int) -> None:
-    """Set the file's mode: libraries that write and rename a file of their own (safetensors) leave it unreadable to
-    others."""
+    """Set the file's mode: libraries that rename a file of their own (safetensors) leave it unreadable to others."""
     if _permissions(scratch) != mode:
         with suppress(PermissionError):  # file systems that know no permissions
             scratch.chmod(mode)

@@ -48,7 +48,6 @@ MAX_CHANNELS = 6
 """Most channels of one joint: three positions and three rotations."""
 
 AXES = {"X": 0, "Y": 1, "Z": 2}
-"""Index of an axis in a vector."""
 
 _WORD = re.compile(r"\s*+([{}]|[^\s{}]++)")
 _NAME = re.compile(r"\s*+([^\n{}]*+)")
@@ -121,7 +120,6 @@ class Hierarchy:
     parents: tuple[int, ...]
     """Index of each joint's parent; -1 for the root."""
     offsets: tuple[Offset, ...]
-    """OFFSET of each joint."""
     channels: tuple[tuple[str, ...], ...]
     """CHANNELS of each joint as `Xposition`, `Zrotation`; empty for a joint that never moves."""
     end_offsets: Mapping[int, Offset]
@@ -273,7 +271,6 @@ class BvhText:
     """Content of a BVH file."""
 
     hierarchy: Hierarchy
-    """Joints, channels and offsets."""
     frame_time: str
     """Seconds of one frame, as printed."""
     values: np.ndarray
@@ -451,15 +448,7 @@ def read(path: str | PathLike[str], *, lossy: bool) -> tuple[Motion, MissingValu
     values = _fill_missing(tree, text.values)
     _, rest, moving = _classify_translations(tree, values)
     unit = guess_unit(tree.names, tree.parents, rest, end_offsets=tree.end_offsets, moving=moving)
-    layout = BvhLayout(
-        unit.metres_per_unit,
-        tree,
-        frame_rate(text.frame_time),
-        text.frame_time,
-        text.encoding,
-        text.values,
-        unit_doubt=unit.unit_doubt,
-    )
+    layout = BvhLayout(**vars(unit), **vars(text), fps=frame_rate(text.frame_time))
     return _build_motion(layout, values), _find_missing(tree, lost, moving)
 
 
@@ -479,7 +468,6 @@ def _build_motion(layout: BvhLayout, values: np.ndarray) -> Motion:
 
 
 def _fill_missing(tree: Hierarchy, values: np.ndarray) -> np.ndarray:
-    """Fill in the channels that are NaN with numbers."""
     if not np.isnan(values).any():
         return values
     done = missing.hold_last(values)

@@ -206,9 +206,7 @@ class CharacterSource:
     path: Path
     """The file; read again when the character is written or drawn."""
     armature: str
-    """Name of the armature in it."""
     frames: RestFrames
-    """Its joints at rest."""
     nodes: tuple[int | str, ...]
     """By joint what the file calls it: the index of a node, the path of a prim; `NEW_NODE` for one that it lacks."""
     stamp: tuple[int, int]
@@ -234,18 +232,9 @@ class CharacterSource:
             another = f"{chosen.file.name}#{chosen.armature or ''}/{others[0]}"
             names = len(found.animations)
             warn_once(f"{chosen.file}: reads {what} of {names} animations; choose another as {another!r}")
-        return CharacterSource(
-            chosen.file.resolve(),
-            found.armature,
-            frames,
-            tuple(found.nodes),
-            _stamp_file(chosen.file),
-            found.animation,
-            found.metres_per_unit,
-            found.humanoid,
-            found.armatures,
-            found.animations,
-        )
+        same = ("armature", "animation", "metres_per_unit", "humanoid", "armatures", "animations")
+        kept, file = {name: getattr(found, name) for name in same}, chosen.file
+        return CharacterSource(file.resolve(), frames=frames, nodes=(*found.nodes,), stamp=_stamp_file(file), **kept)
 
     @property
     def has_new_root(self) -> bool:

@@ -190,8 +190,7 @@ def find_armatures(scene: ufbx.Scene) -> list[Armature[ufbx.Node]]:
 
 
 def _read_bind_poses(scene: ufbx.Scene, armature: Armature[ufbx.Node]) -> list[dict[int, Array]]:
-    """Return world matrices (4, 4) by joint of the bind poses of the file: by its skins, and by
-    its bind poses."""
+    """Return world matrices (4, 4) by joint of the bind poses of the file: by its skins, and by its bind poses."""
     index_of = {node.typed_id: joint for joint, node in enumerate(armature.nodes)}
     skins: dict[int, Array] = {}
     for cluster in each(scene.skin_clusters):

@@ -157,18 +157,14 @@ class Gltf:
     """A glTF document with its buffers. What is not there, or no tree, is a Refusal."""
 
     path: Path
-    """The file."""
     tree: Json
-    """The document."""
     buffers: list[bytes]
-    """Bytes of each buffer."""
 
     def all(self, kind: str) -> list[Json]:
         """Return all of the document's `nodes`, `skins`, `accessors`, ..."""
         return self.tree.get(kind, [])
 
     def get(self, kind: str, index: int) -> Json:
-        """Return one of them."""
         found = self.all(kind)
         if not 0 <= index < len(found):
             raise Refusal(f"has no {kind}[{index}], but {len(found)}")
@@ -731,12 +727,8 @@ def _save_character(motion: Motion, path: str | PathLike[str], source: Character
     if source.has_new_root:
         nodes[0] = _add_node_above(tree, nodes[1], source.frames.names[0])
     animation = _build_character_animation(motion, source, nodes, tree, appended, Path(path).stem)
-    kept = [
-        a
-        for a, name in zip(tree.get("animations", []), _name_animations(gltf), strict=True)
-        if name != source.animation
-    ]
-    tree["animations"] = [animation, *kept]
+    named = zip(tree.get("animations", []), _name_animations(gltf), strict=True)
+    tree["animations"] = [animation, *(other for other, name in named if name != source.animation)]
     if motion.licence:
         asset = tree["asset"]
         extras = asset.get("extras")
@@ -747,18 +739,16 @@ def _save_character(motion: Motion, path: str | PathLike[str], source: Character
 
 
 def _gather(path: Path) -> tuple[Gltf, Json, list[bytes]]:
-    """Read a file; also return a copy of the document with one buffer, and that buffer's pieces: other files are put
-    into it."""
+    """Read a file; also return a copy of the document with one buffer, and its pieces: other files are put into it."""
     gltf = read_file(path)
     tree = copy.deepcopy(gltf.tree)
     pieces: list[bytes] = []
-    starts, size = [], 0
+    starts = []
 
     def append(data: bytes) -> int:
-        nonlocal size
+        start = sum(map(len, pieces))
         pieces.extend([data, bytes(-len(data) % 4)])
-        size += len(data) + -len(data) % 4
-        return size - len(data) - -len(data) % 4
+        return start
 
     for buffer, data in zip(tree.get("buffers", []), gltf.buffers, strict=True):
         starts.append(append(data if buffer.get("uri") is None else data[: buffer["byteLength"]]))
@@ -798,8 +788,7 @@ class _Arrays:
         self.tree, self.size, self.pieces = tree, size, list[bytes]()
 
     def add(self, values: Array, target: int | None = None) -> int:
-        """Add numbers, (n,) or (n, width), floats with 32 bits, with least and greatest; return the index of the new
-        accessor."""
+        """Add numbers, (n,) or (n, width), floats with 32 bits, with least and greatest; return the accessor."""
         table = np.ascontiguousarray(values, np.float32 if values.dtype.kind == "f" else None).reshape(len(values), -1)
         views, accessors = self.tree.setdefault("bufferViews", []), self.tree.setdefault("accessors", [])
         views.append({"buffer": 0, "byteOffset": self.size, "byteLength": table.nbytes})
@@ -834,7 +823,7 @@ def _build_character_animation(
             turned[:, joint] = _beside_own_scale(own, turned[:, joint])
         for path, values in (("translation", moved[:, joint]), ("rotation", turned[:, joint])):
             constant = bool((np.ptp(values, axis=0) < _STILL).all())
-            usual = np.array(own.get(path, (0.0, 0.0, 0.0) if path == "translation" else (0.0, 0.0, 0.0, 1.0)))
+            usual = np.array(own.get(path, _AT_REST[path]))
             if constant and path == "translation" and np.allclose(values[0], usual, rtol=1e-6, atol=1e-6):
                 continue
             output = appended.add(values[:1] if constant else values)
@@ -846,10 +835,8 @@ def _add_node_above(tree: Json, node: int, name: str) -> int:
     """Put a node that does nothing above a node, in its place among its parent's children or in the scenes."""
     tree["nodes"].append({"name": name, "children": [node]})
     added = len(tree["nodes"]) - 1
-    for holder in (
-        *(n.get("children", []) for n in tree["nodes"][:-1]),
-        *(s.get("nodes", []) for s in tree.get("scenes", [])),
-    ):
+    holders = [n.get("children", []) for n in tree["nodes"][:-1]] + [s.get("nodes", []) for s in tree.get("scenes", [])]
+    for holder in holders:
         holder[:] = [added if child == node else child for child in holder]
     return added
 

@@ -21,8 +21,7 @@ class MissingValues:
     rotations: Bool[Tensor, "frames joints"]
     """Missing local rotations; the motion repeats the last known one."""
     positions: Bool[Tensor, "frames joints"]
-    """Missing positions within the parent, of the root in the world; the motion interpolates linearly between known
-    ones."""
+    """Missing positions in the parent, of the root in the world; the motion interpolates linearly between known."""
 
     @staticmethod
     def none(frames: int, joints: int) -> "MissingValues":
@@ -62,8 +61,7 @@ def hold_last(values: np.ndarray) -> np.ndarray:
 
 
 def interpolate_nan(values: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
-    """Interpolate NaN in columns (frames, width) linearly between known numbers; `otherwise` (width,) where none is
-    known."""
+    """Interpolate NaN in columns (frames, width) linearly; `otherwise` (width,) where no number is known."""
     done, frame = values.copy(), np.arange(len(values))
     for column in np.flatnonzero(np.isnan(values).any(axis=0)):
         known = ~np.isnan(values[:, column])

@@ -40,7 +40,6 @@ class CharacterPath:
     """A character's file and what is chosen of it."""
 
     file: Path
-    """The file."""
     armature: str | None = None
     """Name of the armature; None where the file has one."""
     animation: str | None = None
@@ -178,13 +177,11 @@ class FoundCharacter:
     humanoid: dict[str, str] = field(default_factory=dict)
     """Joint by canonical name, where the file itself maps them (VRM)."""
     licence: str = ""
-    """Licence of the motion that was read."""
     fault: str = ""
     """Fault of the meshes; empty without one."""
     animations: dict[str, float] = field(default_factory=dict)
     """Seconds by name of the animations that fit the character; empty unless its motion was read."""
     animation: str | None = None
-    """Name of the animation that was read."""
     poses: Poses | None = None
     """Its poses at its keys, or else `motion`."""
     motion: tuple[Fraction, Array] | None = None
@@ -333,8 +330,7 @@ def split_polygons(counts: Array, skipped: Array | None = None) -> tuple[Array, 
 
 
 def mean_at_vertices(corners: Array, vertices: Array, count: int) -> Array:
-    """Return the mean (count, width) of values at corners (n, width), which belong to `vertices` (n,); a vertex without
-    corners has 0.8."""
+    """Return the mean (count, width) of values at corners (n, width) of `vertices` (n,); 0.8 of one without corners."""
     total, number = np.zeros((count, corners.shape[1])), np.zeros(count)
     np.add.at(total, vertices, corners)
     np.add.at(number, vertices, 1.0)

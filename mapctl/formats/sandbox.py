@@ -44,8 +44,12 @@ def call(reader: Callable[..., Any], path: str | PathLike[str], **options: Any) 
     seconds = SECONDS + SECONDS_PER_MEBIBYTE * Path(path).stat().st_size / 2**20
     request = pickle.dumps(MEMORY_BYTES) + pickle.dumps((reader, str(Path(path).absolute()), options))
     words = [sys.executable, "-P", "-c", "from mapctl.formats import sandbox; sandbox.serve()"]
+    # mapctl is found there, and nothing starts threads
+    paths = [_ROOT, *filter(None, [os.environ.get("PYTHONPATH")])]
+    single = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "PXR_WORK_THREAD_LIMIT"), "1")
+    environment = {**os.environ, **single, "PYTHONPATH": os.pathsep.join(paths), "PYTHONIOENCODING": "utf-8"}
     try:
-        done = subprocess.run(words, input=request, capture_output=True, timeout=seconds, env=_environment())
+        done = subprocess.run(words, input=request, capture_output=True, timeout=seconds, env=environment)
     except subprocess.TimeoutExpired:
         raise FileFormatError(path, f"cannot be read within {seconds:.0f} seconds") from None
     if done.returncode == 0:
@@ -85,10 +89,3 @@ def serve() -> None:
     with os.fdopen(answer, "wb") as opened:
         pickle.dump(outcome, opened, protocol=5)
     os._exit(0)
-
-
-def _environment() -> dict[str, str]:
-    """Return this process's environment, in which mapctl is found and nothing starts threads."""
-    paths = [_ROOT, *filter(None, [os.environ.get("PYTHONPATH")])]
-    single = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "PXR_WORK_THREAD_LIMIT"), "1")
-    return {**os.environ, **single, "PYTHONPATH": os.pathsep.join(paths), "PYTHONIOENCODING": "utf-8"}

@@ -51,8 +51,7 @@ def _find_adapter(kind: type) -> TypeAdapter:
 
 
 def _parse_toml(path: str | PathLike[str], what: str) -> str:
-    """Return the file's table as JSON. Its size and the depth of its keys are bounded: tomllib takes the square of
-    both."""
+    """Return the file's table as JSON. Size and depth of keys are bounded: tomllib takes the square of both."""
     raw = read_bytes(path)
     if len(raw) > _MAX_BYTES:
         raise FileFormatError(path, f"has {len(raw) >> 10} KiB, allowed are {_MAX_BYTES >> 10} for a {what}")

@@ -75,8 +75,7 @@ def read_character(path: Path, **choice: str | None) -> FoundCharacter:
 
 
 def find_character(path: str, *, armature: str | None, animation: str | None, wanted: str) -> FoundCharacter:
-    """Read a skeleton, and `wanted` besides: `rest` nothing, `motion` its animation, `mesh` its triangles. Refusal
-    names why not."""
+    """Read a skeleton, and for `motion` its animation, for `mesh` its triangles. Refusal names why not."""
     try:
         stage = open_stage(path)
         listed, prims = find_skeletons(stage)
@@ -228,11 +227,8 @@ class SkeletonPrim:
     """A UsdSkel.Skeleton, read."""
 
     prim: Usd.Prim
-    """The prim."""
     joints: list[str]
-    """Paths of its joints."""
     names: list[str]
-    """Names of its joints, unique."""
     parents: list[int]
     """Index of each joint's parent, -1 where it has none."""
     bind: Array | None
@@ -662,13 +658,11 @@ class NewMotion:
     """A motion of a skeleton, to be written."""
 
     skeleton: str
-    """Path of the skeleton's prim."""
     replaced: str | None
     """Name of the animation that it was read from."""
     stem: str
     """Name of a new one."""
     rate: float
-    """Frames per second."""
     translations: Array
     """(frames, joints, 3) of the skeleton's joints in the file's order, in their parents' frames."""
     rotations: Array
@@ -836,10 +830,7 @@ def _build_stage(motion: "Motion") -> Usd.Stage:
     stage, rate, joints = Usd.Stage.CreateInMemory(), float(motion.fps), joint_paths(motion.skeleton)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    stage.SetTimeCodesPerSecond(rate)
-    stage.SetFramesPerSecond(rate)
-    stage.SetStartTimeCode(0)
-    stage.SetEndTimeCode(motion.num_frames - 1)
+    codes = _set_times(stage, None, motion.num_frames, rate).tolist()
     top = UsdSkel.Root.Define(stage, _ROOT)
     stage.SetDefaultPrim(top.GetPrim())
     name, body = build_skinned_body(motion)
@@ -862,7 +853,7 @@ def _build_stage(motion: "Motion") -> Usd.Stage:
     animation = UsdSkel.Animation.Define(stage, f"{_ROOT}/motion")
     animation.CreateJointsAttr(joints)
     animation.CreateScalesAttr(Vt.Vec3hArray.FromNumpy(np.ones((len(joints), 3), np.float16)))
-    translations, codes = all_translations(motion).astype(np.float32), list(range(motion.num_frames))
+    translations = all_translations(motion).astype(np.float32)
     if not motion.moving_offsets and (translations[:, 0] == translations[0, 0]).all():
         animation.CreateTranslationsAttr().Set(Vt.Vec3fArray.FromNumpy(translations[0]))
     else:

@@ -66,7 +66,6 @@ class OutOfRange:
     """A joint that turns beyond its range."""
 
     joint: str
-    """Canonical name."""
     frame: int
     """Frame in which it is farthest beyond."""
     degrees: float

@@ -131,8 +131,7 @@ def body_forward(features, columns, ground, headings, bones, positions, heels, w
 
 @inner
 def rotation_vector_gradient(world, torque, x, y, z):
-    """Return the gradient to a joint's rotation vector from the torque about it: the right Jacobian's transpose, in its
-    frame."""
+    """Return the gradient to a joint's rotation vector from the torque about it: the right Jacobian's transpose."""
     ux = world[0, 0] * torque[0] + world[1, 0] * torque[1] + world[2, 0] * torque[2]
     uy = world[0, 1] * torque[0] + world[1, 1] * torque[1] + world[2, 1] * torque[2]
     uz = world[0, 2] * torque[0] + world[1, 2] * torque[1] + world[2, 2] * torque[2]
@@ -216,7 +215,6 @@ class Bones(NamedTuple):
     """A skeleton's tree with its heels, which are points of the feet."""
 
     parents: np.ndarray
-    """Index of each joint's parent."""
     offsets: np.ndarray
     """(joints, 3): each joint in its parent's frame, metres, float64."""
     feet: np.ndarray
@@ -321,7 +319,6 @@ def _tabulate_bones(skeleton: Skeleton) -> Bones:
 
 
 def _allocate_points(features: Tensor, bones: Bones) -> tuple[Tensor, Tensor]:
-    """Memory for the positions of joints and of heels."""
     joints, heels = (features.new_empty(*features.shape[:2], len(points), 3) for points in (bones.offsets, bones.heels))
     return joints, heels
 

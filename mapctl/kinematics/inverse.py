@@ -50,7 +50,7 @@ def solve_inverse_kinematics(
     for joint, parent in enumerate(skeleton.parents):
         above = None if parent < 0 else world[parent]
         if above is not None:
-            at.append(at[parent] + rotations.rotate(above, offsets[joint].expand(frames, 3)))
+            at.append(at[parent] + rotations.rotate(above, offsets[joint]))
         turn = start[:, joint] if above is None else rotations.multiply(above, start[:, joint])
         children = skeleton.children(joint)
         if joint in bending and bending[joint].shown:
@@ -127,10 +127,10 @@ def _find_usual_middle(
 ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3"]]:
     """Return where elbow or knee go when the whole limb rotates toward a direction: where a straight one would bend,
     and the bone's vector."""
-    knee = rotations.rotate(turn, upper.expand(direction.shape))
-    foot = knee + rotations.rotate(rotations.multiply(turn, bent), lower.expand(direction.shape))
+    knee = rotations.rotate(turn, upper)
+    foot = knee + rotations.rotate(rotations.multiply(turn, bent), lower)
     toward = rotations.between_vectors(foot, direction)
-    bend = upper.new_tensor(limb.bend_direction).expand(direction.shape)
+    bend = upper.new_tensor(limb.bend_direction)
     return rotations.rotate(rotations.multiply(toward, turn), bend), rotations.rotate(toward, knee)
 
 
@@ -154,7 +154,7 @@ def _align_bones(
     turn: Float[Tensor, "frames 4"], bones: Sequence[Float[Tensor, "3"]], aims: Sequence[Float[Tensor, "frames 3"]]
 ) -> Float[Tensor, "frames 4"]:
     """Rotate `turn` further so that the bones point along the aims: one bone exactly, several by least squares."""
-    pointing = [rotations.rotate(turn, bone.expand(len(turn), 3)) for bone in bones]
+    pointing = [rotations.rotate(turn, bone) for bone in bones]
     if len(bones) == 1:
         return rotations.multiply(rotations.between_vectors(pointing[0], aims[0]), turn)
     # Kabsch: the rotation that brings one set of vectors nearest to the other.
@@ -179,10 +179,9 @@ def _align_bend_plane(
     if len(below) != 1:
         return turn
     offsets = skeleton.offsets.to(positions)
-    frames = len(turn)
-    bone = rotations.rotate(turn, offsets[child].expand(frames, 3))
+    bone = rotations.rotate(turn, offsets[child])
     knee = at + bone
-    would = rotations.rotate(rotations.multiply(turn, start[:, child]), offsets[below[0]].expand(frames, 3))
+    would = rotations.rotate(rotations.multiply(turn, start[:, child]), offsets[below[0]])
     axis = torch.nn.functional.normalize(bone, dim=-1)
     wanted = positions[:, below[0]] - knee
     would, wanted = (torch.nn.functional.normalize(vector, dim=-1) for vector in (would, wanted))

@@ -13,13 +13,18 @@ from mapctl.numerics.easing import smootherstep
 from mapctl.skeleton import CANONICAL
 
 
+def rotate_world(motion: Motion, turn: Float[Tensor, "*frames 4"] | None) -> Motion:
+    """Rotate a motion about the origin (xyzw), by one rotation or one of each frame; None for no rotation."""
+    if turn is None:
+        return motion
+    every, local = turn.expand(motion.num_frames, 4), motion.local_quat_xyzw.clone()
+    local[:, 0] = rotations.multiply(every, local[:, 0])
+    return replace(motion, root_position=rotations.rotate(every, motion.root_position), local_quat_xyzw=local)
+
+
 def rotate_about_vertical(motion: Motion, angle: Float[Tensor, "*frames"] | float) -> Motion:
     """Rotate a motion about the vertical through the origin, radians; positive turns +Z toward +X."""
-    angle = torch.as_tensor(angle, dtype=motion.root_position.dtype)
-    turn = rotations.about_y(angle).expand(motion.num_frames, 4)
-    quats = motion.local_quat_xyzw.clone()
-    quats[:, 0] = rotations.multiply(turn, quats[:, 0])
-    return replace(motion, local_quat_xyzw=quats, root_position=rotations.rotate(turn, motion.root_position))
+    return rotate_world(motion, rotations.about_y(torch.as_tensor(angle, dtype=motion.root_position.dtype)))
 
 
 def move_to(motion: Motion, ground_xz: Float[Tensor, "2"], *, frame: int = 0) -> Motion:
@@ -79,6 +84,6 @@ def measure_look_angle(motion: Motion, positions: Float[Tensor, "#frames 3"]) ->
 
 def _find_turn(motion: Motion, joint: int, positions: Float[Tensor, "#frames 3"]) -> Float[Tensor, "frames 3"]:
     """Find the rotation vectors in the world that turn a joint's facing toward positions, as the head sees them."""
-    facing = rotations.rotate(motion.joint_rotations()[:, joint], _FORWARD.expand(motion.num_frames, 3))
+    facing = rotations.rotate(motion.joint_rotations()[:, joint], _FORWARD)
     wanted = positions.to(facing) - motion.joint_positions()[:, _HEAD]
     return rotations.to_rotation_vector(rotations.between_vectors(facing, wanted))

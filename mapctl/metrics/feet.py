@@ -77,7 +77,7 @@ def locate_heels(motion: Motion) -> Float[Tensor, "frames 2 3"]:
     """Locate the left and the right heel of a motion of canonical joints whose foot frames are aligned with the world
     while feet are flat: world positions, metres (see `skeleton.find_heels`)."""
     feet, offsets = motion.skeleton.indices(FEET), find_heels(motion.skeleton)
-    turned = rotations.rotate(motion.joint_rotations()[:, feet], offsets.expand(motion.num_frames, 2, 3))
+    turned = rotations.rotate(motion.joint_rotations()[:, feet], offsets)
     return motion.joint_positions()[:, feet] + turned
 
 

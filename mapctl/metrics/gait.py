@@ -41,8 +41,7 @@ def compute_ground_velocity(ground: Float[ndarray, "frames 2"], fps: float) -> F
 
 
 def measure_speed(ground: Float[ndarray, "frames 2"], fps: float) -> Float[ndarray, " frames"]:
-    """Measure the speed of the hips over the ground, m/s, from their x and z in metres, without the sway within a
-    stride; 0 for a single frame."""
+    """Measure the speed of `compute_ground_velocity`, m/s; 0 for a single frame."""
     return np.linalg.norm(compute_ground_velocity(ground, fps), axis=1) if len(ground) > 1 else np.zeros(len(ground))
 
 

@@ -38,8 +38,7 @@ class RealismSettings:
     folds: int = 4
     """Number of parts of the clips; each is held out once while a network learns on the others."""
     steps: int = 400
-    """Number of optimiser steps of each network, so that large sets cost no more than small ones. More make a stricter
-    judge."""
+    """Number of optimiser steps of each network, whatever the sets' size. More make a stricter judge."""
     batch: int = 64
     """Number of windows a step, half from each set."""
     width: int = 48
@@ -64,15 +63,13 @@ class Realism:
     """How generated motion compares with mocap."""
 
     accuracy: float
-    """Balanced held-out accuracy of the network, generated against mocap, a share: 0.5 is perfect, 1 is separated every
-    time."""
+    """Balanced held-out accuracy of the network, generated against mocap, a share: 0.5 is perfect."""
     floor_accuracy: float
     """Balanced held-out accuracy of the network, one half of the mocap's clips against the other, a share likewise."""
     frechet: float
     """Frechet distance of generated windows to mocap's, no unit: coordinates are in mocap's standard deviations."""
     floor_frechet: float
-    """Frechet distance between the halves, in the same coordinates without unit; halves are smaller sets, which adds to
-    it."""
+    """Frechet distance between the halves, in the same coordinates; halves are smaller sets, which adds to it."""
     generated_windows: int
     """Number of windows of the generated clips."""
     mocap_windows: int
@@ -132,8 +129,7 @@ def measure_window_realism(
 
 
 def canonical_positions(motion: Motion) -> Float[Tensor, "frames joints 3"]:
-    """Return the world positions (metres) of the canonical joints at 30 frames a second; RequestError for rigs not
-    known."""
+    """Return world positions (metres) of the canonical joints at 30 frames a second; RequestError for unknown rigs."""
     return retarget.to_canonical(motion)[0].resample(PRIOR_FPS).joint_positions()
 
 
@@ -182,8 +178,7 @@ class Basis:
 
     @staticmethod
     def of(windows: Float[Tensor, "windows frames channels"], dims: int) -> "Basis":
-        """Fit the first `dims` components, fewer where there are fewer windows, by the smaller of both Gram
-        matrices."""
+        """Fit the first `dims` components, fewer of fewer windows, by the smaller of both Gram matrices."""
         flat = windows.flatten(1)
         mean, std = flat.mean(0), flat.std(0, correction=0).clamp_min(_LEAST_STD)
         centred, dims = (flat - mean) / std, min(dims, *flat.shape)
@@ -254,8 +249,7 @@ def compute_held_out_accuracy(
 def _train_network(
     sets: Sequence[Float[Tensor, "_ frames channels"]], settings: RealismSettings
 ) -> Callable[[Float[Tensor, "_ frames channels"]], Float[Tensor, " _"]]:
-    """Train three convolutions over time, the mean over the remaining frames, and one logit: positive for the first
-    set."""
+    """Train three convolutions over time, their mean over frames, and one logit: positive for the first set."""
     windows = torch.cat(list(sets))
     mean, std = windows.mean((0, 1)), windows.std((0, 1), correction=0).clamp_min(_LEAST_STD)
     layers: list[nn.Module] = []
@@ -292,8 +286,7 @@ class Diversity(NamedTuple):
 
 
 def measure_diversity(samples: Sequence[Motion]) -> Diversity:
-    """Measure diversity of several samples from one start (any known rig); RequestError for fewer than two, or other
-    lengths."""
+    """Measure diversity of samples from one start (any known rig); RequestError for fewer than two of one length."""
     lengths = sorted({sample.num_frames / sample.fps for sample in samples})
     if len(samples) < 2 or len(lengths) > 1:
         shown = " and ".join(f"{float(length):.4g}" for length in lengths)

@@ -30,7 +30,6 @@ class MinimumJerkTrack:
 
     @staticmethod
     def rest_at(value: Float[Tensor, " size"]) -> "MinimumJerkTrack":
-        """Begin at rest."""
         return MinimumJerkTrack(value, torch.zeros_like(value), torch.zeros_like(value), value)
 
     @property

@@ -10,8 +10,7 @@ from torch import Tensor
 def pairwise_weights(
     count: int, sigma: float, dtype: torch.dtype, device: torch.device | None = None
 ) -> Float[Tensor, "count count"]:
-    """Return Gaussian weights between all pairs of frames, 1 with itself; `sigma` is in frames. Memory is count
-    squared."""
+    """Return Gaussian weights between all pairs of frames, 1 with itself; `sigma` is in frames."""
     frame = torch.arange(count, dtype=dtype, device=device)
     return torch.exp(-0.5 * ((frame[:, None] - frame) / sigma).square())
 

@@ -34,7 +34,6 @@ class Capture:
 
     @property
     def frames(self) -> int:
-        """Number of frames."""
         return self.root.shape[1]
 
     @staticmethod

@@ -120,8 +120,7 @@ def smooth_columns(
 
 
 def measure_kept_noise(hertz: float, fps: float) -> float:
-    """Measure the share of white noise's power that a smoother leaves, far from the ends: the mean square of its
-    response."""
+    """Measure the share of white noise's power that a smoother leaves, far from the ends: its mean squared response."""
     turn = torch.linspace(0, math.pi, 2001, dtype=torch.float64)
     response = 1 / (1 + (torch.sin(turn / 2) / math.sin(math.pi * hertz / fps)) ** (2 * _ORDER))
     return float(response.square().mean())

@@ -12,6 +12,9 @@
 - Stretched bones: offsets in six-channel files that vary only by noise.
 - Lead pose: a T-pose in frame 0 that does not belong to the motion, and the frames after it that an exporter's filter
   blended with it.
+- Swapped limbs: left and right are exchanged for a few frames, as by a tracker that mistakes its labels. They are
+  exchanged back where the frames beside predict that better than what was captured, by the Bayes factor of all joints
+  of both limbs; what neither explains may be an outlier, so that no single joint decides (Kass and Raftery 1995).
 """
 
 import math
@@ -38,6 +41,7 @@ from mapctl.recording.noise_estimation import (
     estimate_angle_noise,
     estimate_position_noise,
 )
+from mapctl.retarget import RigMap
 from mapctl.skeleton import CANONICAL
 
 NOISE_CM = 0.2
@@ -61,7 +65,6 @@ class Artefact:
     """Noise's sigma, height of a spike or of a floating toe, distance of a slide, largest error of an offset; 0 for a
     dropout and frozen frames."""
     unit: str
-    """Unit of the amount."""
 
 
 def list_artefacts(
@@ -118,8 +121,7 @@ class Inspection:
         return self.seen | ((still | ~self.seen).all(dim=0) & self.seen.any(dim=0))
 
     def _held(self) -> Float[Tensor, "frames joints 4"]:
-        """Hold the last observed rotation where nothing is observed: signs are then chosen between frames that
-        count."""
+        """Hold the last observed rotation where none is observed: signs are then chosen between frames that count."""
         return torch.take_along_dim(self.motion.local_quat_xyzw, last_observed(self.seen.T).T[..., None], dim=0)
 
     def repaired(self) -> Motion:
@@ -549,3 +551,86 @@ def estimate_lead_shares(canonical: Motion) -> Float[Tensor, " lead"]:
     count = int(free[0]) if len(free) else longest
     blended = (gone - share[:, None, None] * whole)[:count].square().sum() < (gone - whole)[:count].square().sum()
     return torch.cat([torch.zeros(1).to(share), share[:count].clamp(0, 1)]) if blended else torch.zeros(1)
+
+
+_MOST_SWAPPED = 4  # of a run: what differs for longer may be a turn of the body
+_ARM = ("Shoulder", "UpperArm", "LowerArm", "Hand")
+_LIMBS = ((("UpperLeg", "LowerLeg", "Foot", "Toes"),), (_ARM, _ARM[1:]))  # a tracker may know no shoulders
+_OUTLIER = math.log(SHARE / ROTATIONS)
+_SWAP_ROUNDS = 2
+
+
+def exchange_swapped_limbs(
+    motion: Motion, rigmap: RigMap, hidden: Bool[Tensor, "frames joints"]
+) -> tuple[Motion, list[Artefact]]:
+    """Return the motion with limbs exchanged back where left and right were swapped, and these frames as faults.
+
+    Rotations are exchanged as those from the T-pose, or as they are in the file, whichever is likelier.
+    """
+    quats, faults = motion.local_quat_xyzw.clone(), []
+    own, rigged, parents = motion.local_quat_xyzw, rigmap.joints, torch.tensor(motion.skeleton.parents)
+    rests = (rigmap.rest_quat_xyzw.to(quats), quats.new_tensor([0, 0, 0, 1]).expand(quats.shape[1], 4))
+    for limb in _LIMBS:
+        found = []
+        for parts in limb:
+            pairs = [(rigged.get(f"left{part}"), rigged.get(f"right{part}")) for part in parts]
+            known = [(left, right) for left, right in pairs if left is not None and right is not None]
+            joints, partners = ([pair[k] for pair in known] + [pair[1 - k] for pair in known] for k in (0, 1))
+            for rest in rests if known else ():
+                # With rest R, a parent's P: a partner's rotation q' is P^-1 P' q' R'^-1 R in the joint's own frame.
+                before = rotations.multiply(rotations.inverse(rest[parents[joints]]), rest[parents[partners]])
+                after = rotations.multiply(rotations.inverse(rest[partners]), rest[joints])
+                exchanged = rotations.multiply(rotations.multiply(before, own[:, partners]), after)
+                runs = _find_swaps(own[:, joints], exchanged, ~hidden[:, joints])
+                found += [(gain, start, stop, joints, exchanged) for gain, start, stop in runs]
+        free = torch.ones(motion.num_frames, dtype=torch.bool)
+        for _, start, stop, joints, exchanged in sorted(found, key=lambda run: -run[0]):
+            if free[start:stop].all():
+                free[start:stop] = False
+                turns = rotations.turns_between(quats[start:stop, joints], exchanged[start:stop])
+                degrees = math.degrees(float(turns.norm(dim=-1).max()))
+                quats[start:stop, joints] = exchanged[start:stop]
+                faults.append(Artefact(motion.skeleton.names[joints[0]], start, stop, "swap", degrees, "deg"))
+    return (replace(motion, local_quat_xyzw=quats) if faults else motion), faults
+
+
+def _find_swaps(
+    captured: Float[Tensor, "frames limb 4"],
+    exchanged: Float[Tensor, "frames limb 4"],
+    seen: Bool[Tensor, "frames limb"],
+) -> list[tuple[float, int, int]]:
+    """Find runs of frames that are likelier exchanged, with the logarithm of how much likelier. Candidates lie between
+    two frames from which on the exchanged rotations are nearer to the frame before."""
+    same, other = ((1 - (each[1:] * captured[:-1]).sum(dim=-1).abs()).sum(dim=-1) for each in (captured, exchanged))
+    turns = (other < same).nonzero()[:, 0].add(1).tolist()
+    found = [(0.0, start, stop) for start in turns for stop in turns if 0 < stop - start <= _MOST_SWAPPED]
+    prior = math.log(SHARE / len(captured))  # one clip in a hundred has one
+    for _ in range(_SWAP_ROUNDS):  # what is likelier as captured is evidence for the rest
+        if not found:
+            break
+        swapped = torch.zeros_like(seen[:, 0])
+        for _, start, stop in found:
+            swapped[start:stop] = True
+        gains = _measure_gain(captured, exchanged, seen, swapped)
+        gains = [(float(gains[start:stop].sum()) + prior, start, stop) for _, start, stop in found]
+        found = [run for run in gains if run[0] > 0]
+    return found
+
+
+def _measure_gain(
+    captured: Float[Tensor, "frames limb 4"],
+    exchanged: Float[Tensor, "frames limb 4"],
+    seen: Bool[Tensor, "frames limb"],
+    swapped: Bool[Tensor, " frames"],
+) -> Float[Tensor, " frames"]:
+    """Return by how much the logarithm of the density of exchanged rotations is larger, given frames not swapped."""
+    values = 2 * choose_continuous_signs(torch.where(swapped[:, None, None], exchanged, captured))
+    values, centre = values - values.mean(dim=0), values.mean(dim=0)
+    least = values.new_full((values.shape[1],), RESOLUTION)
+    prediction = predict_frames(values, seen & ~swapped[:, None], least)
+    densities = []
+    for each in (exchanged, captured):
+        errors = [(sign * 2 * each - centre - prediction.mean).norm(dim=-1) for sign in (1, -1)]
+        likely = replace(prediction, error=torch.minimum(*errors)).log_density()
+        densities.append(torch.logaddexp(likely, likely.new_tensor(_OUTLIER)))
+    return (densities[0] - densities[1]).where(seen, 0.0).sum(dim=-1)

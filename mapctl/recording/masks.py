@@ -1,5 +1,4 @@
-"""Masks: the frames and joints of a recording that its user marks as unreliable. CSV with the columns joint, start,
-stop."""
+"""Masks: frames and joints of a recording that its user marks as unreliable. CSV with columns joint, start, stop."""
 
 import re
 from collections.abc import Sequence
@@ -33,8 +32,7 @@ class Mask:
     """Frames in which a joint counts as missing."""
 
     joint: str
-    """Joint name on the recording's own rig or canonical, in any case; `*` for all of it, `root position` for the
-    root's."""
+    """Joint name on the recording's rig or canonical, in any case; `*` for all, `root position` for the root's."""
     start: int
     """First frame, from 0."""
     stop: int
@@ -63,8 +61,7 @@ def load_masks(path: str | PathLike[str]) -> tuple[Mask, ...]:
 
 
 def masks_from_missing(motion: Motion, missing: MissingValues) -> tuple[Mask, ...]:
-    """Return masks of what a file marks as missing. A joint that travels beside the body's own travel is lost with its
-    position."""
+    """Return masks of what a file marks as missing. A joint that travels beside the body is lost with its position."""
     travels, joints = motion.travelling_joint, missing.rotations.clone()
     below = motion.skeleton.children(0)
     if travels == 0 and len(below) == 1 and bool(missing.positions[:, below[0]].all()):

@@ -16,7 +16,7 @@ from torch import Tensor
 from mapctl import formats, kinematics, rotations
 from mapctl.errors import RequestError
 from mapctl.formats.character import CharacterSource
-from mapctl.formats.examples import is_example
+from mapctl.kinematics.moving import rotate_world
 from mapctl.motion import Motion
 from mapctl.retarget.anatomy import RigPoses, goes_on_four_legs
 from mapctl.retarget.joint_matching import Match, correct_sides, match
@@ -32,7 +32,6 @@ class RigMap(TPose):
     rig: Rig
     """The rig's names and T-pose."""
     rig_skeleton: Skeleton
-    """The rig's own skeleton."""
     joint_of: tuple[int | None, ...]
     """For each canonical joint the rig's joint, None where the rig has only an End Site or nothing."""
     skeleton: Skeleton
@@ -66,7 +65,7 @@ def load_rig(name_or_path: str | PathLike[str]) -> Rig:
             return rig
     if path.suffix.lower() == ".toml":
         return read_rig_toml(path)
-    if not path.suffix and not is_example(path):
+    if not path.suffix and not formats.is_example(path):
         names = ", ".join(rig.name for rig in known_rigs())
         raise RequestError(f"no rig {text!r}; known rigs: {names}; or name a TOML file or a clip")
     found = to_canonical(formats.load(path))[1]
@@ -148,7 +147,7 @@ def to_canonical(motion: Motion, rig: Rig | RigMap | None = None) -> tuple[Motio
         if joint is None:  # an End Site rotates with its parent
             picked.append(picked[CANONICAL.parents[CANONICAL.index(name)]])
         else:
-            picked.append(rotations.multiply(world[:, joint], rotations.inverse(tpose).expand(len(world), 4)))
+            picked.append(rotations.multiply(world[:, joint], rotations.inverse(tpose)))
     local = kinematics.local_from_world(CANONICAL.parents, torch.stack(picked, dim=1))
     hips = motion.joint_positions()[:, rigmap.joints["hips"]]
     found = Motion(rigmap.skeleton, motion.fps, hips, local, licence=motion.licence)
@@ -181,10 +180,10 @@ def from_canonical(motion: Motion, rigmap: RigMap, original: Motion | None = Non
     targets, hips = motion.joint_rotations(), motion.root_position
     if rigmap.upright_quat_xyzw is not None:  # back to the file's world
         back = rotations.inverse(rigmap.upright_quat_xyzw)
-        targets = rotations.multiply(back.expand(targets.shape), targets)
+        targets = rotations.multiply(back, targets)
         hips = rotations.rotate(back.expand(frames, 4), hips)
     pairs = enumerate(zip(rigmap.joint_of, rigmap.tpose_quat_xyzw, strict=True))
-    wanted = {j: rotations.multiply(targets[:, c], b.expand(frames, 4)) for c, (j, b) in pairs if j is not None}
+    wanted = {j: rotations.multiply(targets[:, c], b) for c, (j, b) in pairs if j is not None}
     local, world = [], []
     for joint, parent in enumerate(skeleton.parents):
         above = world[parent] if parent >= 0 else None
@@ -242,12 +241,3 @@ def put_upright(motion: Motion, rig: Rig | None = None) -> tuple[Motion, tuple[s
         return rotate_world(motion, identify_rig(motion.skeleton, rig, motion=motion).upright_quat_xyzw), ()
     except RequestError:
         return motion, (UNKNOWN_RIG_NOTE,)
-
-
-def rotate_world(motion: Motion, turn: Float[Tensor, "4"] | None) -> Motion:
-    """Rotate the world of a motion (xyzw); None for no rotation."""
-    if turn is None:
-        return motion
-    every, local = turn.expand(motion.num_frames, 4), motion.local_quat_xyzw.clone()
-    local[:, 0] = rotations.multiply(every, local[:, 0])
-    return replace(motion, root_position=rotations.rotate(every, motion.root_position), local_quat_xyzw=local)

@@ -36,7 +36,6 @@ class RigPoses:
     orientations: Float[Tensor, "poses joints 4"]
     """World rotations (xyzw)."""
     skeleton: Skeleton
-    """Skeleton of the rig."""
     joint_of: tuple[int | None, ...]
     """Index of the rig's joint for each canonical joint, or None."""
 
@@ -108,7 +107,7 @@ class RigPoses:
         site = self.skeleton.end_offsets.get(self.skeleton.names[joint])
         if site is None or max(map(abs, site)) < 1e-4:
             return None
-        return start + rotations.rotate(self.orientations[:, joint], start.new_tensor(site).expand_as(start)) - start
+        return start + rotations.rotate(self.orientations[:, joint], start.new_tensor(site)) - start
 
 
 def next_joint(name: str) -> str | None:

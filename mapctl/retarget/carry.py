@@ -92,7 +92,6 @@ class RetargetedMotion:
     motion: Motion
     """On canonical joints, with the bones of the body."""
     changes: Changes = Changes()
-    """The changes."""
     fingers: Mapping[int, Float[Tensor, "frames 4"]] = field(default_factory=dict)
     """Local rotations (xyzw) of the body's finger joints that turn as the source's, by joint of its rig."""
 
@@ -170,7 +169,7 @@ def _detect_bearing(own: Motion) -> Bool[Tensor, "frames 2"]:
     speed = (positions[step:, TOES] - positions[:-step, TOES]).norm(dim=-1) * (fps / step)
     before = step // 2  # a frame's speed is that of the time around it
     speed = torch.cat([speed[:1].expand(before, 2), speed, speed[-1:].expand(step - before, 2)])
-    forward = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(own.num_frames, 2, 3)
+    forward = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     slope = rotations.rotate(own.joint_rotations()[:, FEET], forward)[..., 1].abs()
     bears = positions[:, HIP_JOINTS, 1] - positions[:, TOES, 1] > _HIPS_SHARE * leg_length(own.skeleton)
     level = slope < math.sin(math.radians(_LEVEL_DEG))
@@ -186,9 +185,7 @@ def _transfer_root(
     to_thighs = body.leveled.offsets[HIP_JOINTS].mean(0) - scale * own.skeleton.offsets[HIP_JOINTS].mean(0)
     turns = own.joint_rotations()[:, 0]
     # The hips' rotation is noisy; what they carry at another distance is not to shake for it.
-    aside = gaussian.smooth(
-        rotations.rotate(turns, to_thighs.expand(own.num_frames, 3)), _SMOOTH_SECONDS * float(own.fps)
-    )
+    aside = gaussian.smooth(rotations.rotate(turns, to_thighs), _SMOOTH_SECONDS * float(own.fps))
     # Ankles over the floor while feet lie flat, mean of both.
     ankle = (body.stance.standing_height - body.leveled.offsets[TOES, 1]).mean()
     others = (source.stance.flat_height - own.skeleton.offsets[TOES, 1]).mean()
@@ -269,10 +266,10 @@ def _foot_length_offset(own: Motion, moved: Motion, scale: float) -> Float[Tenso
     A foot whose heel is raised pivots on its toes, one whose toes are raised on its heel, right below the ankle: then
     the ankle follows the source's trajectory, as if the foot were flat.
     """
-    longer = (scale * own.skeleton.offsets - moved.skeleton.offsets)[TOES].expand(own.num_frames, 2, 3)
+    longer = (scale * own.skeleton.offsets - moved.skeleton.offsets)[TOES]
     turns = own.joint_rotations()[:, FEET]
     heading, tilt = rotations.split_heading(turns)
-    forward = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(longer)
+    forward = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     rises = (rotations.rotate(turns, axis)[..., 1] for axis in (forward, forward.roll(-1, -1)))
     up = torch.rad2deg(torch.atan2(*rises))
     on_toes = 1 - smootherstep(up / _HEEL_DEG) * (1 - smootherstep((up - _MAX_HEEL_DEG) / _MAX_HEEL_DEG))
@@ -372,10 +369,10 @@ def _carry_fingers(
         rest, their_rest = ours[body.rig_skeleton.parents[joint]], theirs[source.rig_skeleton.parents[other]]
         idle, their_idle = body.idle_quat_xyzw[joint], source.idle_quat_xyzw[other]
         # From the parent's frame in one T-pose to that in the other; each rotation is what it adds to rest.
-        turn = rotations.multiply(rotations.inverse(rest), their_rest).expand(clip.num_frames, 4)
-        added = rotations.multiply(clip.local_quat_xyzw[:, other], rotations.inverse(their_idle).expand_as(turn))
+        turn = rotations.multiply(rotations.inverse(rest), their_rest)
+        added = rotations.multiply(clip.local_quat_xyzw[:, other], rotations.inverse(their_idle))
         added = rotations.multiply(rotations.multiply(turn, added), rotations.inverse(turn))
-        found[joint] = rotations.multiply(added, idle.expand_as(turn))
+        found[joint] = rotations.multiply(added, idle)
     return found
 
 

@@ -52,8 +52,7 @@ class Stance:
     toe_height: Float[Tensor, "2"]
     """Height of the toe joints over the floor while they rest on it, metres: as seen in a clip, its lowest."""
     flat_height: Float[Tensor, "2"]
-    """Height of the toe joints over the floor while feet lie flat, metres: higher where toes sink into the floor at
-    times."""
+    """Height of the toe joints over the floor while feet lie flat, metres: higher where toes sink in at times."""
     tilt: Float[Tensor, "2 2"]
     """Pitch of foot and toes by side, radians, positive up, against the T-pose while they lie flat."""
     floor: float = 0.0
@@ -74,8 +73,7 @@ class Stance:
 
     @staticmethod
     def at_rest(skeleton: Skeleton) -> "Stance":
-        """Return the stance of bones alone (canonical names): feet as in the T-pose, toes as high as the canonical in
-        scale."""
+        """Return the stance of bones alone: feet as in the T-pose, toes as high as the canonical in scale."""
         scale = leg_length(skeleton) / leg_length(CANONICAL)
         height = torch.full((2,), TOE_REST_HEIGHT * scale, dtype=torch.float64)
         return Stance(height, height, torch.zeros(2, 2).double())
@@ -135,7 +133,7 @@ def rotate_foot_frames(motion: Motion, pitch: Float[Tensor, "2 2"]) -> Motion:
     With the negative tilt of its stance, feet are flat in a motion's T-pose; with the tilt itself they are as before.
     """
     by_joint = _rotations_about_x(pitch)
-    world = rotations.multiply(motion.joint_rotations(), rotations.inverse(by_joint).expand_as(motion.local_quat_xyzw))
+    world = rotations.multiply(motion.joint_rotations(), rotations.inverse(by_joint))
     local = rotations.make_sign_continuous(kinematics.local_from_world(CANONICAL.parents, world))
     return replace(motion, skeleton=_rotate_bones(motion.skeleton, by_joint), local_quat_xyzw=local)
 
@@ -156,7 +154,7 @@ def _estimate_tilt(clip: Motion, flat: Bool[Tensor, "frames 2"]) -> Float[Tensor
     """Estimate the tilt of foot and toes by side, radians: its median over flat frames; 0 for a side without any."""
     forward = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     turns = clip.joint_rotations()[:, [*FEET, *TOES]].reshape(-1, 2, 2, 4)
-    up = torch.asin(rotations.rotate(turns, forward.expand(*turns.shape[:3], 3))[..., 1].clamp(-1, 1))
+    up = torch.asin(rotations.rotate(turns, forward)[..., 1].clamp(-1, 1))
     found = [up[flat[:, k], :, k].median(dim=0).values for k in range(2) if flat[:, k].any()]
     if not found:
         return torch.zeros(2, 2, dtype=torch.float64)
@@ -321,11 +319,5 @@ def load_standing_character(path: str | PathLike[str]) -> Motion | None:
         main = np.take_along_axis(mesh.joints, mesh.weights.argmax(axis=1)[:, None], axis=1)[:, 0]
         sole = float(mesh.vertices[np.isin(main, sorted(below)), 1].min(initial=np.inf))
     down = torch.tensor([0.0, sole if np.isfinite(sole) else 0.0, 0.0], dtype=torch.float64)
-    frames = torch.zeros(_FRAMES, dtype=torch.long)
-    return replace(
-        rest,
-        fps=_FPS,
-        root_position=(rest.root_position - down)[frames],
-        local_quat_xyzw=rest.local_quat_xyzw[frames],
-        moving_offsets={joint: track[frames] for joint, track in rest.moving_offsets.items()},
-    )
+    standing = replace(rest, fps=_FPS, root_position=rest.root_position - down)
+    return standing.pick(torch.zeros(_FRAMES, dtype=torch.long))

@@ -32,8 +32,7 @@ _MERGE_METRES = 0.06  # metres that such contacts are apart at most
 def merge_contacts(
     touching: Bool[Tensor, "frames points"], positions: Float[Tensor, "frames points 3"], fps: float
 ) -> list[Spans]:
-    """Return by point the spans in which it touches, merged where noise alone parts them: soon after each other, and
-    at one ground position, metres."""
+    """Return by point the spans in which it touches, merged where they follow soon at one ground position, metres."""
     found: list[Spans] = [[] for _ in range(touching.shape[1])]
     for point, start, stop in true_intervals(touching):
         spans = found[point]
@@ -58,7 +57,6 @@ def hold_through(spans: Spans, values: Float[Tensor, "spans width"], frames: int
 
 
 def mean_by_span(values: Float[Tensor, "frames width"], spans: Spans) -> Float[Tensor, "spans width"]:
-    """Return the mean over each span."""
     return torch.stack([values[start:stop].mean(0) for start, stop in spans])
 
 
@@ -250,7 +248,7 @@ def _hand_points(motion: Motion, size: float) -> Float[Tensor, "frames points 3"
     offsets = torch.zeros(*along.shape, 3, dtype=torch.float64)
     offsets[..., 0] = size * along
     turns = motion.joint_rotations()[:, _HANDS, None].expand(-1, -1, len(_POINTS), 4)
-    reaching = rotations.rotate(turns, offsets.expand(*turns.shape[:3], 3))
+    reaching = rotations.rotate(turns, offsets)
     return (motion.joint_positions()[:, _HANDS, None] + reaching).flatten(1, 2)
 
 
@@ -337,14 +335,13 @@ def _place_segments(motion: Motion) -> _Segments:
     """Place the segments of a body in every frame of a motion of canonical joints."""
     size, positions, turns = _girth(motion.skeleton), motion.joint_positions(), motion.joint_rotations()
     begin, end = positions[:, _STARTS], positions[:, _STOPS].clone()
-    tip = (size * torch.tensor(_HEAD_TIP, dtype=torch.float64)).expand(len(positions), 3)
+    tip = size * torch.tensor(_HEAD_TIP, dtype=torch.float64)
     skull = len(_TRUNK) - 1
     end[:, skull] = begin[:, skull] + rotations.rotate(turns[:, _STARTS[skull]], tip)
     return _Segments(begin, end, turns[:, _STARTS], size * _WIDTHS)
 
 
 def _find_nearest(points: Float[Tensor, "frames points 3"], body: _Segments) -> _Near:
-    """Find where points are on each segment of a body."""
     axis = (body.end - body.begin)[:, None]
     offset = points[:, :, None] - body.begin[:, None]
     share = (offset * axis).sum(-1, keepdim=True) / axis.square().sum(-1, keepdim=True).clamp_min(1e-9)

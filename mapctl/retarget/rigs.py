@@ -28,7 +28,6 @@ class _RigSettings:
     """What a rig and its file have alike."""
 
     about: str = ""
-    """Description of the rig, one line."""
     also: tuple[str, ...] = ()
     """Further joints of the rig, that distinguish it from its relatives."""
     trunk: tuple[str, ...] = ()
@@ -51,11 +50,9 @@ class Rig(_RigSettings):
     joints: Mapping[str, str]
     """Canonical joint name to the rig's own."""
     tpose: Mapping[str, Mapping[str, list[float]]] = field(default_factory=dict)
-    """Canonical joint name to where the joint's local x and y axes point in the T-pose; others as the rest pose has
-    them."""
+    """Canonical joint name to where the joint's local x and y axes point in the T-pose; others as in the rest pose."""
     idle: Mapping[str, list[float]] = field(default_factory=dict)
-    """Local rotation (xyzw) in the T-pose by the rig's own joint; joints that are canonical ones or left out have
-    none."""
+    """Local rotation (xyzw) in the T-pose by the rig's own joint; none for joints that are canonical or left out."""
     aliases: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Canonical joint name to the other names that versions of the rig use, one entry a version."""
     metres_per_unit: float | None = None

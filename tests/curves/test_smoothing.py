@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from mapctl import curves
-from mapctl.curves.smoothing import smooth_path
+from mapctl.curves import smooth_path
 
 
 def jittered(curve, *, spacing=0.03, sigma=0.01):

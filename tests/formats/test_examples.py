@@ -7,7 +7,7 @@ import make_example
 from helpers import run, walk
 
 import mapctl
-from mapctl.formats import examples
+from mapctl import formats
 
 NAME = "example:noisy-walk"
 
@@ -23,11 +23,11 @@ def test_it_is_the_walk_of_its_page():
     assert (motion.num_frames, float(motion.fps)) == (240, 30)
     assert bones(motion) == bones(make_example.performer())
     assert (motion.root_position[-1] - motion.root_position[0]).norm() > 3
-    file = examples.resolve(NAME)
+    file = formats.resolve_example(NAME)
     assert file.stat().st_size < 300_000
     page = (file.parent / "LICENSE.md").read_text("utf-8")
     assert "free for any use" in page.replace("\n", " ")
-    assert {f"{name}.bvh" for name in examples.list_examples()} == set(re.findall(r"^\| `(.+?)`", page, re.M))
+    assert {f"{name}.bvh" for name in formats.list_examples()} == set(re.findall(r"^\| `(.+?)`", page, re.M))
 
 
 def test_other_commands_and_rigs_take_it(tmp_path, capsys):
@@ -37,4 +37,4 @@ def test_other_commands_and_rigs_take_it(tmp_path, capsys):
     walk(10).save(tmp_path / "walk.bvh")
     assert run("convert", tmp_path / "walk.bvh", tmp_path / "onto.bvh", "--rig", NAME) == 0
     assert mapctl.load(tmp_path / "onto.bvh").skeleton.names == mapctl.load(NAME).skeleton.names
-    assert mapctl.load(tmp_path / "part.npz").licence == examples.LICENCE
+    assert mapctl.load(tmp_path / "part.npz").licence == formats.EXAMPLES_LICENCE

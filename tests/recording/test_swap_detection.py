@@ -9,7 +9,7 @@ from helpers import walk
 from rig_maker import Make, make, names_of
 
 from mapctl import retarget
-from mapctl.recording.swaps import exchange_swapped_limbs
+from mapctl.recording.inspection import exchange_swapped_limbs
 
 LEG, ARM = ("UpperLeg", "LowerLeg", "Foot", "Toes"), ("Shoulder", "UpperArm", "LowerArm", "Hand")
 AXES = make(Make(names_of("mixamo"), bones_along_x=True))  # left and right arms have other axes
