@@ -141,6 +141,12 @@ class Displacement:
         """Angle that the hips turn by, radians."""
         return float(torch.diff(self.track[:, 2]).abs().sum())
 
+    @property
+    def leads_aside(self) -> bool:
+        """Whether the hips go to a side rather than ahead or back."""
+        aside, ahead = rotations.rotate_ground(self.track[-1, :2] - self.track[0, :2], -self.track[0, 2]).tolist()
+        return abs(aside) > abs(ahead)
+
     def count_steps(self) -> int:
         """Count the steps that it takes at least: the first and the last are half of one between."""
         length = _STEP * leg_length(self.start.skeleton)
@@ -179,14 +185,15 @@ def plan_footsteps(displacement: Displacement, frames: int, *, least: int = 0) -
     """Plan the steps of a displacement within so many frames at PRIOR_FPS, `least` of them at least; none where no foot
     has to move.
 
-    Feet alternate, or one follows to the side of the other. Of the plans that begin with either foot the one counts
+    Feet alternate; to a side, one may also follow the other. Of the plans that begin with either foot the one counts
     whose feet are least apart at most, and do not cross: the first is on the side to which the body turns or steps.
     """
     if not least and displacement.distance < _MOVED and displacement.turn < _TURNED:
         return []
     count = max(displacement.count_steps(), frames // _SLOWEST, least)
     plans = [_lay_steps([(first + number) % 2 for number in range(count)], frames) for first in range(2)]
-    plans += [_lay_side_steps(displacement, first, frames) for first in range(2)]
+    if displacement.leads_aside:
+        plans += [_lay_side_steps(displacement, first, frames) for first in range(2)]
     plan = min(plans, key=lambda plan: _measure_strain(displacement, plan))
     shares = torch.tensor([step.share for step in plan], dtype=torch.float64)
     toes = [displacement.toes_at(foot, shares)[0][:, ::2].tolist() for foot in range(2)]

@@ -9,6 +9,7 @@ from stage import Actor, live_app, run
 from mapctl.curves.obstacles import Obstacle
 from mapctl.intent.steering import Command
 from mapctl.streaming.messages import Message
+from mapctl.streaming.sender import guide
 
 
 class Source:
@@ -29,7 +30,10 @@ class Stream:
     def __init__(self):
         self.heard: list[tuple] = []
 
-    def put(self, character, due, seconds, root, quats):
+    guide = staticmethod(guide)
+
+    def put(self, character, due, seconds, root, quats, guidance):
+        assert len(guidance) == len(root)
         self.heard.append(("put", character, seconds, len(root)))
 
     def forget(self, character):

@@ -23,9 +23,8 @@ from mapctl import kinematics, report
 from mapctl.commands.shared.inputs import read_clip
 from mapctl.commands.shared.options import ReadOptions
 from mapctl.commands.shared.outputs import add_licence
-from mapctl.curves import Curve
+from mapctl.curves import Curve, smooth_path
 from mapctl.curves.obstacles import Obstacle
-from mapctl.curves.smoothing import smooth_path
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.path import SpeedProfile, TimedSpeed
