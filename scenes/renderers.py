@@ -48,7 +48,6 @@ class Figure:
     """Metres by which its surface is around the body's, so that it covers the same body in the same pose."""
 
     def surface(self) -> Surface:
-        """Return the body's surface."""
         skin = self.body.surface(self.frame)
         assert skin.normals is not None, "bodies are lit"
         rgba = np.column_stack([self.tint(skin.rgba[:, :3]), skin.rgba[:, 3]])
@@ -66,7 +65,6 @@ class Content:
     ground: Sequence[Surface]
     """Flat surfaces in the order in which they cover each other; the figures' shadows fall on them."""
     figures: Sequence[Figure]
-    """Bodies above the ground."""
     veils: Sequence[Figure] = ()
     """Bodies that one sees through (see `blend_veils`); they throw no shadow."""
 
@@ -152,13 +150,10 @@ class OffscreenPainter:
         gl = self._gl
         self._scene = gl.Scene(bg_color=[*colours.rgb(colours.BACKGROUND), 1.0])
         self._camera = self._scene.add(gl.PerspectiveCamera(yfov=1.0, znear=_CLIP_NEAR, zfar=_CLIP_FAR))
-        looks = {
-            Layer.CLOSED: {},
-            Layer.OPEN: {"doubleSided": True},
-            Layer.SHEER: {"doubleSided": True, "alphaMode": "BLEND"},
-        }
+        sides, sheer = {"doubleSided": True}, {"doubleSided": True, "alphaMode": "BLEND"}
         self._looks = {
-            layer: gl.MetallicRoughnessMaterial(baseColorFactor=[1.0] * 4, **look) for layer, look in looks.items()
+            layer: gl.MetallicRoughnessMaterial(baseColorFactor=[1.0] * 4, **look)
+            for layer, look in ((Layer.CLOSED, {}), (Layer.OPEN, sides), (Layer.SHEER, sheer))
         }
 
     def paint(self, view: View, content: Content) -> Array:
