@@ -22,7 +22,7 @@ from typing import Annotated, Any
 import tyro
 
 from mapctl import __version__
-from mapctl.commands import COMMANDS, MANY_THREADS, SUBCOMMANDS, Runnable, load_command
+from mapctl.commands import COMMANDS, MANY_THREADS, SUBCOMMANDS, load_command
 from mapctl.commands.shared.command import INTERRUPTED, INVALID, SIGNALLED, UNREAD, use_single_thread
 from mapctl.errors import MapctlError, RequestError
 
@@ -77,7 +77,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return status
 
 
-def parse(words: Sequence[str]) -> Runnable:
+def parse(words: Sequence[str]) -> Any:
     """The command that the words ask for. RequestError where there is none; SystemExit after --help."""
     name, *others = words or [""]
     if name not in COMMANDS:
@@ -97,7 +97,7 @@ def _join(kinds: Mapping[str, type]) -> Any:
     return reduce(or_, (_subcommand(name, kind) for name, kind in kinds.items()))
 
 
-def _read_options(kind: Any, words: Sequence[str], prog: str, description: str) -> Runnable:
+def _read_options(kind: Any, words: Sequence[str], prog: str, description: str) -> Any:
     explained = io.StringIO()
     try:
         with redirect_stderr(explained):

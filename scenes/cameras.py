@@ -65,9 +65,7 @@ class View:
     fov: float
     """Vertical field of view, radians."""
     width: int
-    """Width of the picture, pixels."""
     height: int
-    """Height of the picture, pixels."""
 
     def project(self, points: Array) -> Array:
         """Project world points (..., 3) to (..., 3): pixels right, pixels down, metres in front of the camera."""

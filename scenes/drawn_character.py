@@ -25,7 +25,6 @@ class DrawnMotion:
     """A motion put on a character, to be filmed."""
 
     mesh: CharacterMesh
-    """Triangles of the character."""
     motion: Motion
     """The motion on the joints of the character's file."""
     bones: Motion
@@ -36,8 +35,7 @@ class DrawnMotion:
     """Puts further frames of the same source on the character, as poses that are requested."""
 
     def build_body(self, fps: Fraction, colour: Array) -> Body:
-        """Build the body at a film's rate; `colour` is that of its bones (red, green, blue, 0 to 1), where these are
-        drawn."""
+        """Build the body at a film's rate; `colour` (red, green, blue, 0 to 1) is that of bones that are drawn."""
         bones = replace(self.bones, source=None).resample(fps)
         return Body(self.motion.resample(fps), self.mesh, Anatomy(bones), colour)
 
@@ -49,7 +47,6 @@ class DrawnCharacter:
     path: str
     """Its file, and what is chosen of it."""
     mesh: CharacterMesh
-    """Its triangles."""
     standing: Motion
     """It stands on the floor in its rest pose."""
 

@@ -114,8 +114,7 @@ _MAX_GHOSTS = 16
 
 
 def draw_contact_sheet(stage: Stage, brush: Painter, camera: CameraSettings, size: tuple[int, int]) -> Array:
-    """Draw the sheet, (height, width, 3) uint8 of the given width; the ghosts' picture has `size`, the stills come
-    below."""
+    """Draw the sheet, (height, width, 3) uint8: a picture of the ghosts of this `size`, and stills as wide below."""
     wide = replace(camera, kind="top" if camera.kind == "top" else "fixed")
     top = brush.paint(stage.views(wide, size)[0], stage.compose_ghosts(_choose_ghost_frames(stage)))
     # One actor has upright close stills; several need the whole picture.
@@ -124,18 +123,6 @@ def draw_contact_sheet(stage: Stage, brush: Painter, camera: CameraSettings, siz
         count, tall, kind = 6, 1.15, "top" if camera.kind == "top" else "follow"
     gap = np.full((_measure_gap(size[0]), size[0], 3), 255, np.uint8)
     return np.concatenate([top, gap, _draw_stills(stage, brush, replace(camera, kind=kind), size[0], count, tall)])
-
-
-def draw_strips(
-    strips: Sequence[tuple[str, Stage]], brush: Painter, camera: CameraSettings, size: tuple[int, int]
-) -> Array:
-    """Draw a row of stills of each stage, at the same shares of its time, below each other and under its name: (height,
-    width, 3) uint8 of the given width, all rows together as high as they come."""
-    rows, gap = [], np.full((_measure_gap(size[0]), size[0], 3), 255, np.uint8)
-    for name, stage in strips:
-        name = name.replace(" and ", "\n")
-        rows += [gap, _draw_stills(stage, brush, camera, size[0], _STRIP_STILLS, _STRIP_SHAPE, name)]
-    return np.concatenate(rows[1:])
 
 
 def _draw_stills(
@@ -254,8 +241,12 @@ def draw_strips_to(
     (path,) = check_outputs([out], size)
     if path.suffix.lower() != ".png":
         raise RequestError(f"motions below each other are a .png, not {path}")
-    strips = [(name, Stage([Shot(motion)])) for name, motion in motions]
-    save_png(path, draw_strips(strips, select_painter(None), CameraSettings("follow"), size))
+    brush, camera, width = select_painter(None), CameraSettings("follow"), size[0]
+    rows, gap = [], np.full((_measure_gap(width), width, 3), 255, np.uint8)
+    for name, motion in motions:
+        stage, title = Stage([Shot(motion)]), name.replace(" and ", "\n")
+        rows += [gap, _draw_stills(stage, brush, camera, width, _STRIP_STILLS, _STRIP_SHAPE, title)]
+    save_png(path, np.concatenate(rows[1:]))
 
 
 def check_outputs(out: Sequence[PathOrText], size: tuple[int, int]) -> list[Path]:

@@ -48,7 +48,6 @@ class Figure:
     """Metres by which its surface is around the body's, so that it covers the same body in the same pose."""
 
     def surface(self) -> Surface:
-        """Return the body's surface."""
         skin = self.body.surface(self.frame)
         assert skin.normals is not None, "bodies are lit"
         rgba = np.column_stack([self.tint(skin.rgba[:, :3]), skin.rgba[:, 3]])
@@ -66,7 +65,6 @@ class Content:
     ground: Sequence[Surface]
     """Flat surfaces in the order in which they cover each other; the figures' shadows fall on them."""
     figures: Sequence[Figure]
-    """Bodies above the ground."""
     veils: Sequence[Figure] = ()
     """Bodies that one sees through (see `blend_veils`); they throw no shadow."""
 

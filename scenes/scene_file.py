@@ -215,7 +215,8 @@ def load(path: str | PathLike[str]) -> tuple[SceneDescription, tuple[Curve, ...]
         scene = toml.read(path, SceneDescription, what="scene file", unknown=_list_allowed_keys)
     except RequestError as error:
         raise FileFormatError(path, f"camera: {error}") from error
-    scene = _name_actors(scene)
+    named = (replace(a, name=a.name or f"actor{k}") for k, a in enumerate(scene.actors, start=1))
+    scene = replace(scene, actors=tuple(named))
     _check(path, scene)
     placed = []
     for number, actor in enumerate(scene.actors):
@@ -243,11 +244,6 @@ def _list_allowed_keys(key: Sequence[int | str]) -> str:
     inner = {"keys": ShotKey, "footsteps": SceneFootstep}
     table = next((inner[str(part)] for part in key[1:-1] if part in inner), known.get(str(key[0]), SceneDescription))
     return f"allowed: {', '.join(item.name for item in fields(table))}"
-
-
-def _name_actors(scene: SceneDescription) -> SceneDescription:
-    named = [replace(a, name=a.name or f"actor{k}") for k, a in enumerate(scene.actors, start=1)]
-    return replace(scene, actors=tuple(named))
 
 
 def _check(path: str | PathLike[str], scene: SceneDescription) -> None:

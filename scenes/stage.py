@@ -33,7 +33,6 @@ class Mark:
     """A thing to reach, to look at, or to be at."""
 
     surface: Surface
-    """Its shape and its colours."""
     seconds: tuple[float, float]
     """From when to when it is requested, seconds since the actor's first frame."""
 
@@ -43,7 +42,6 @@ class Targets:
     """All that an actor is requested, beside its curve."""
 
     marks: Sequence[Mark] = ()
-    """Marks in the world."""
     poses: Sequence[Motion] = ()
     """Poses, each one frame in its place, of the actor's skeleton."""
 
@@ -71,7 +69,6 @@ class StagedActor:
 
     body: Body
     target: Surface | None
-    """Ribbon of its curve."""
     trail: Surface
     planted: Array
     """(frames, feet) whether the foot is planted."""
@@ -111,13 +108,7 @@ class Stage:
         grid = overlays.build_grid(np.concatenate([*paths, *self._curves])[:, [0, 2]])
         self._still = merge_surfaces([grid, *targets, *props])
 
-    @property
-    def seconds(self) -> float:
-        """Duration of the film."""
-        return float(self.num_frames / self.fps)
-
     def content(self, film_frame: int) -> Content:
-        """Return the content of one frame."""
         figures = [Figure(player.body, player.frame(film_frame)) for player in self.players]
         trails = [overlays.cut_ribbon(p.trail, f.frame + 1) for p, f in zip(self.players, figures, strict=True)]
         marks = [_build_contact_marks(p, f.frame) for p, f in zip(self.players, figures, strict=True)]
@@ -126,8 +117,7 @@ class Stage:
         return Content(ground, figures, self._veils)
 
     def compose_ghosts(self, film_frames: Sequence[int]) -> Content:
-        """Compose all actors at several times in one picture, earlier ones paler, with the whole trails and all that
-        they are requested."""
+        """Compose all actors at several times, earlier ones paler, with the whole trails and all that is requested."""
         fades = np.linspace(0.62, 0.0, len(film_frames)) if len(film_frames) > 1 else [0.0]
         moments = list(zip(film_frames, fades, strict=True))
         figures = [

@@ -4,19 +4,8 @@ may import every package, and nothing else imports them.
 
 from collections.abc import Mapping
 from importlib import import_module
-from typing import Protocol, runtime_checkable
 
 from mapctl.commands.train import KINDS
-
-
-@runtime_checkable
-class Runnable(Protocol):
-    """Protocol of sub-commands."""
-
-    def run(self) -> int:
-        """Do the work and return the exit status; MapctlError for what is wrong with the request."""
-        ...
-
 
 COMMANDS = {
     "demo": ("Demo", "A character walks a figure of eight: motion, film, contact sheet and report."),
@@ -40,12 +29,12 @@ COMMANDS = {
     "bench": ("Bench", "Cost on this machine: energy and gradient of a window, following a curve, steering."),
 }
 """Class of options and summary of each command, by the name the user types, in the order of the help."""
-SUBCOMMANDS: dict[str, Mapping[str, type[Runnable]]] = {"train": KINDS}
+SUBCOMMANDS: dict[str, Mapping[str, type]] = {"train": KINDS}
 """The sub-commands of commands that have some."""
 MANY_THREADS = {"blender-addon", "convert", "info", "render", "train"}
 """Commands that compute with as many threads as there are, or decide it themselves."""
 
 
-def load_command(name: str) -> type[Runnable]:
+def load_command(name: str) -> type:
     """Import the module of a command and return its class of options."""
     return getattr(import_module(f"{__name__}.{name.replace('-', '_')}"), COMMANDS[name][0])

@@ -14,9 +14,8 @@ from controllers.shots.shot import follow
 from controllers.shots.walk import FollowSettings, build_follow_terms
 from controllers.steering import steer
 from mapctl import curves, report
-from mapctl.commands.shared import options
+from mapctl.commands.shared import options, outputs
 from mapctl.commands.shared.command import ModelCommand
-from mapctl.commands.shared.outputs import print_table
 from mapctl.features import LAYOUT, PRIOR_FPS
 from mapctl.intent.steering import Command
 from mapctl.problem.objective import Objective
@@ -35,8 +34,7 @@ class Bench(ModelCommand):
 
     prints_licence: ClassVar[bool] = False
 
-    prior: options.Name = "locomotion"
-    """A bundled prior, or the file or run folder of a trained one."""
+    prior: options.Prior = "locomotion"
     live: options.Name = "locomotion-live"
     """The prior that is steered: a bundled one, or the file or run folder of a trained one."""
     json: bool = False
@@ -61,7 +59,6 @@ SIZES = Sizes()
 
 
 def run(command: Bench) -> int:
-    """Measure, and print a table or JSON."""
     prior, live = priors.load(command.prior), priors.load(command.live)
     rows = [_measure_evaluation(prior, count, SIZES.repeats) for count in SIZES.candidates]
     rows += [_measure_follow(prior, seconds) for seconds in SIZES.seconds]
@@ -70,7 +67,7 @@ def run(command: Bench) -> int:
         print(report.to_json({"bench": "speed", "versions": report.package_versions(), "rows": rows}), end="")
     else:
         columns = list(dict.fromkeys(name for row in rows for name in row))
-        print_table(columns, [[row.get(name) for name in columns] for row in rows], title="cost, one thread")
+        outputs.print_table(columns, [[row.get(name) for name in columns] for row in rows], title="cost, one thread")
     return 0
 
 

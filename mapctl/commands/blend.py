@@ -11,7 +11,6 @@ from controllers.inbetweening.blend import LimbTransfer, blend
 from controllers.inbetweening.pipeline import INFILL_REFINEMENT
 from mapctl.commands.shared import inputs, options, results
 from mapctl.commands.shared.command import ModelCommand, conclude
-from mapctl.commands.shared.options import parse_frame, parse_range
 
 
 @dataclass(frozen=True)
@@ -40,19 +39,19 @@ class Blend(ModelCommand, options.RigOptions):
     """Film of the given motion and the new one side by side: .mp4, .gif, .webp or .png."""
     strict: bool = False
     """Exit with status 3 where not all that was requested holds: a margin too short for the limb."""
-    quiet: bool = False
-    """No summary and no progress bar."""
+    quiet: options.Quiet = False
 
 
 def run(command: Blend) -> int:
-    """Check everything, blend, write, report."""
     results.check_destinations(command.out, command.video, given=(command.source, command.other))
     rig = inputs.read_rig(command.rig, command)
     motion = inputs.read_motion(command.source, rig, quiet=command.quiet)
     other = inputs.read_motion(command.other, None, quiet=command.quiet)
-    start, stop = parse_range(command.frames, fps=float(other.fps), frames=other.num_frames, what="range of --frames")
+    fps, count = float(other.fps), other.num_frames
+    start, stop = options.parse_range(command.frames, fps=fps, frames=count, what="range of --frames")
     names = tuple(name.strip() for name in command.joints.split(","))
-    transfer = LimbTransfer(names, start, stop, parse_frame(command.at, fps=float(motion.fps)), margin=command.margin)
+    at = options.parse_frame(command.at, fps=float(motion.fps))
+    transfer = LimbTransfer(names, start, stop, at, margin=command.margin)
     refinement = None if command.no_refine else INFILL_REFINEMENT
     done = blend(motion, other, transfer, priors.load_inbetweener(command.inbetweener), refinement=refinement, rig=rig)
     results.write_result("blend", command, done, motion, rig=rig)

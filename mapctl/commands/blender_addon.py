@@ -56,7 +56,6 @@ class BlenderAddon(Command):
 
 
 def run(command: BlenderAddon) -> int:
-    """Build the zip and write it."""
     if command.out.suffix.lower() != ".zip":
         raise RequestError(f"{command.out}: Blender installs add-ons from .zip files; give the name that ending")
     write_bytes(command.out, build_addon_zip())

@@ -13,7 +13,6 @@ from controllers.inbetweening.pipeline import INFILL_REFINEMENT
 from controllers.inbetweening.proposers import build_inbetweener
 from mapctl.commands.shared import inputs, options, outputs, results
 from mapctl.commands.shared.command import ModelCommand
-from mapctl.commands.shared.outputs import show_progress
 from mapctl.errors import RequestError
 from mapctl.retarget import to_canonical
 from scenes.film import film
@@ -35,28 +34,29 @@ class Chain(ModelCommand, options.RigOptions, options.ProposalOptions):
     """Seed of the gaps' lengths and of what rollouts sample."""
     video: options.MaybeFile = None
     """Film of the motion: .mp4, .gif, .webp or .png."""
-    quiet: bool = False
-    """No summary and no progress bar."""
+    quiet: options.Quiet = False
 
 
 def run(command: Chain) -> int:
-    """Check everything, chain, write, report."""
     options.check_seed(command.seed)
     results.check_proposal(command)
     results.check_destinations(command.out, command.video, given=command.clips)
+    low, colon, high = command.gap.partition(":")
+    if not (colon and low.isdecimal() and high.isdecimal()):
+        raise RequestError(f"--gap is A:B, frames as in 50:100; got {command.gap!r}")
     rig = inputs.read_rig(command.rig, command)
     done = chain(
         [inputs.read_motion(path, rig, quiet=command.quiet) for path in command.clips],
         build_inbetweener(command.method, results.load_models(command)),
         piece=command.piece,
-        gap=_parse_gap(command),
+        gap=(int(low), int(high)),
         refinement=None if command.no_refine else INFILL_REFINEMENT,
         rig=rig,
         generator=torch.Generator().manual_seed(command.seed),
     )
     outputs.save_motion(done.motion, command.out)
     if command.video is not None:
-        with show_progress("filming", quiet=command.quiet) as progress:
+        with outputs.show_progress("filming", quiet=command.quiet) as progress:
             film([(to_canonical(done.motion, rig)[0], None)], command.video, progress=progress)
     if not command.quiet:
         filled = int(done.missing.frames.sum())
@@ -67,10 +67,3 @@ def run(command: Chain) -> int:
         for note in (*done.notes, *done.gap_notes):
             print(note)
     return 0
-
-
-def _parse_gap(command: Chain) -> tuple[int, int]:
-    low, colon, high = command.gap.partition(":")
-    if not (colon and low.isdecimal() and high.isdecimal()):
-        raise RequestError(f"--gap is A:B, frames as in 50:100; got {command.gap!r}")
-    return int(low), int(high)

@@ -11,7 +11,6 @@ from tyro.conf import Positional, arg
 from mapctl import __version__, editing, formats, report, retarget
 from mapctl.commands.shared import folders, inputs, options, outputs
 from mapctl.commands.shared.command import Command
-from mapctl.commands.shared.options import parse_range
 from mapctl.editing.rigged_motion import RiggedMotion
 from mapctl.errors import RequestError
 from mapctl.metrics import feet
@@ -74,8 +73,7 @@ class Convert(Command, options.ReadOptions):
     """For a folder: number of files at once, each in a process of its own."""
     again: bool = False
     """For a folder: convert files again whose result exists already."""
-    quiet: bool = False
-    """No summary and no progress bar."""
+    quiet: options.Quiet = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,13 +95,11 @@ class Conversion:
     """Parsed options, cheap to send to a process."""
 
     command: Convert
-    """The command."""
     fps: Fraction | None
     """Frames per second of the result."""
     fps_in: Fraction | None
     """Frames per second of an .amc."""
     source_rig: Rig | None
-    """Rig of what is read."""
     body: RiggedCharacter | None = None
     """Body that gets the motion; None for the canonical joints, or for the motion's own."""
 
@@ -117,7 +113,6 @@ class Conversion:
         return Conversion(command, fps, fps_in, inputs.read_rig(command.source_rig, command), body)
 
     def convert(self, source: Path) -> Converted:
-        """Read a file and convert it."""
         command, rig, notes = self.command, self.source_rig, list[str]()
         # Of other files than .amc the rate is in the file.
         fps_in = self.fps_in if source.suffix.lower() == ".amc" or not command.source.is_dir() else None
@@ -127,7 +122,7 @@ class Conversion:
             rig = as_rig(identify_rig(motion.skeleton, rig, motion=motion))
         if command.frames is not None:
             fps, frames = float(motion.fps), motion.num_frames
-            motion = motion.slice(*parse_range(command.frames, fps=fps, frames=frames, what="range of frames"))
+            motion = motion.slice(*options.parse_range(command.frames, fps=fps, frames=frames, what="range of frames"))
         changes, cycle, lines = None, None, list[str]()
         if command.rig == "canonical":
             motion, rig = retarget.to_canonical(motion, self.source_rig)[0], retarget.load_rig("canonical")
@@ -184,7 +179,6 @@ def _describe_feet(motion: Motion, rig: Rig | None) -> str:
 
 
 def run(command: Convert) -> int:
-    """Read, convert, write: one file, or every one below a folder."""
     if command.rig is None and (command.report is not None or command.ground != "fit"):
         option = "--report" if command.report is not None else "--ground"
         raise RequestError(f"{option} is about motion on another rig; name one by --rig")

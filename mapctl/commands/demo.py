@@ -9,7 +9,6 @@ from controllers.common.character import Character
 from mapctl import curves, report
 from mapctl.commands.shared import options, outputs
 from mapctl.commands.shared.command import INTERRUPTED, ModelCommand
-from mapctl.commands.shared.outputs import show_progress
 from mapctl.commands.shared.shots import plan_shot, play_shot
 from mapctl.errors import RequestError
 from scenes.cameras import CameraSettings
@@ -26,12 +25,10 @@ class Demo(ModelCommand):
 
     out: options.OutFolder = Path("demo-out")
     """Folder for figure8.bvh, .mp4, .png and .json; created if it does not exist."""
-    prior: options.Name = "locomotion"
-    """A bundled prior, or the file or run folder of a trained one."""
+    prior: options.Prior = "locomotion"
     seed: options.Count = 0
     """Seed of everything random."""
-    quiet: bool = False
-    """No summary and no progress bar."""
+    quiet: options.Quiet = False
 
 
 CURVE, SPEED = "figure8:2", "1.2"
@@ -56,7 +53,7 @@ def run(command: Demo) -> int:
     plan = plan_shot(
         actor, curve, priors.load(command.prior), character=Character(), folder=Path(), options=options.ReadOptions()
     )
-    with show_progress("walking", quiet=command.quiet) as progress:
+    with outputs.show_progress("walking", quiet=command.quiet) as progress:
         done = play_shot(plan, progress=progress)
     with outputs.make_folder(command.out) as folder:
         pictures = [e for e in ("mp4", "png") if e not in missing and not done.interrupted]
@@ -65,7 +62,7 @@ def run(command: Demo) -> int:
         request = options.describe_request("demo", command) | {"curve": CURVE, "speed": SPEED}
         report.write_report(done.report(request), files["json"])
         if films := [files[ending] for ending in ("mp4", "png") if ending in files]:
-            with show_progress("filming", quiet=command.quiet) as progress:
+            with outputs.show_progress("filming", quiet=command.quiet) as progress:
                 actors = [(done.solution.motion, done.request.curve)]
                 film(actors, films, camera=CameraSettings("fixed"), size=_SIZE, progress=progress)
     if not command.quiet:

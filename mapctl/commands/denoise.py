@@ -16,7 +16,6 @@ from controllers.denoising.solution import DenoiseSolution
 from mapctl import formats, report
 from mapctl.commands.shared import folders, inputs, options, outputs, results
 from mapctl.commands.shared.command import ModelCommand, conclude
-from mapctl.commands.shared.outputs import show_progress
 from mapctl.errors import RequestError
 from mapctl.motion import join_licences
 from mapctl.protocols import Denoiser, Inbetweener
@@ -64,8 +63,7 @@ class Denoise(ModelCommand, options.RigOptions):
     strict: bool = False
     """Exit with status 3 where not all that was requested holds: the network was out of its depth for more than half of
     the frames."""
-    quiet: bool = False
-    """No summary and no progress bar."""
+    quiet: options.Quiet = False
 
 
 _MAX_NAMED = 6
@@ -75,7 +73,6 @@ _DEFAULT_DELAY = 0.2  # seconds
 
 
 def run(command: Denoise) -> int:
-    """Check everything, denoise, write, report."""
     if command.causal and command.prior is not None:
         raise RequestError("--causal has no time for a density; leave --prior out")
     if command.causal and command.inbetweener is not None:
@@ -107,7 +104,7 @@ def _denoise_file(command: Denoise) -> DenoiseSolution:
     denoiser = priors.load_denoiser(command.denoiser)
     motion, missing_masks, _ = inputs.read_motion_with_gaps(command.source, rig, quiet=command.quiet)
     masks = (*named_masks, *missing_masks)
-    with show_progress("denoising", quiet=command.quiet) as progress:
+    with outputs.show_progress("denoising", quiet=command.quiet) as progress:
         if command.causal:
             delay = _DEFAULT_DELAY if command.delay is None else command.delay
             return denoise_causal(
@@ -204,7 +201,6 @@ class FileDenoiser:
     """Denoiser of the files of a folder, cheap to send to a process, which loads the networks on first use."""
 
     command: Denoise
-    """The command."""
     denoiser: str
     """Name of the denoiser, with its set of weights."""
     inbetweener: str

@@ -11,7 +11,6 @@ import priors
 from mapctl import curves, formats
 from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.command import ModelCommand, conclude
-from mapctl.commands.shared.outputs import show_progress
 from mapctl.commands.shared.shots import build_obstacles, plan_shot, play_shot, stage_actor
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
@@ -33,11 +32,8 @@ class FollowCurve(ModelCommand, options.ReadOptions, ShotOptions):
     speed: options.MaybeSpeed = None
     """Speed along the curve: a number, or 0:1.0,5:2.5 for 1 m/s at the start rising to 2.5 m/s at 5 m; 1.2 if it is not
     given, and less in corners that turn faster than walking people do."""
-    prior: options.Name = "locomotion"
-    """A bundled prior, or the file or run folder of a trained one."""
-    rig: options.OutRig = "canonical"
-    """Body that moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by name
-    or TOML file, whose joints get the canonical bones."""
+    prior: options.Prior = "locomotion"
+    rig: options.BodyRig = "canonical"
     keys: options.MaybeFile = None
     """TOML file of [[key]] tables: what hands and feet reach for, the head looks at, which pose is held, and when."""
     avoid: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="X,Z,RADIUS")] = ()
@@ -54,8 +50,7 @@ class FollowCurve(ModelCommand, options.ReadOptions, ShotOptions):
     """Scale of a CSV or SVG file; 1 for a CSV and 0.01 for an SVG if not given."""
     strict: bool = False
     """Exit with status 3 where not all that was requested holds."""
-    quiet: bool = False
-    """No summary and no progress bar."""
+    quiet: options.Quiet = False
 
 
 def run(command: FollowCurve) -> int:
@@ -95,14 +90,14 @@ def _follow(command: FollowCurve, file: ShotKeyFile | None) -> int:
         obstacles=[Obstacle.parse(text) for text in command.avoid],
         fps=None if command.fps is None else Fraction(command.fps).limit_denominator(100_000),
     )
-    with show_progress("walking", quiet=command.quiet) as progress:
+    with outputs.show_progress("walking", quiet=command.quiet) as progress:
         done = play_shot(plan, progress=progress)
     outputs.save_motion(done.on_rig, command.out)
     if command.report is not None:
         write_report(done.report(options.describe_request("follow", command)), command.report)
     video = None if done.interrupted else command.video
     if video is not None:
-        with show_progress("filming", quiet=command.quiet) as progress:
+        with outputs.show_progress("filming", quiet=command.quiet) as progress:
             film([stage_actor(done)], video, size=outputs.FILM_SIZE, props=build_obstacles([done]), progress=progress)
     if not command.quiet:
         files = ", ".join(map(str, options.collect_paths(command.out, video, command.report)))

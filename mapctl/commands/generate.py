@@ -16,8 +16,6 @@ from controllers.generation.generate import SIGMA_PLANTED, GenerateSettings, sam
 from mapctl import formats
 from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.command import ModelCommand
-from mapctl.commands.shared.inputs import read_character
-from mapctl.commands.shared.outputs import explain_progress, show_progress
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.metrics.gait import PACES, label_pace
@@ -42,8 +40,7 @@ class Generate(ModelCommand, options.ReadOptions):
     """Temperature of the samples, 0 to 2: 0 is the prior's mean, 1 the prior itself."""
     start: Annotated[str | None, arg(metavar="CLIP|INDEX")] = None
     """A clip (.bvh, .npz, .amc) to continue from, or the index of an initial state for all; sampled if not given."""
-    prior: options.Name = "locomotion"
-    """A bundled prior, or the file or run folder of a trained one."""
+    prior: options.Prior = "locomotion"
     style: Annotated[str | None, arg(metavar="NAME,NAME")] = None
     """Gait, style and pace by the names of the prior's data, such as run or elderly,walk; `none` leaves the prior
     unconditioned. If not given, gait and style are those of the clip that it begins from. Unless a pace is named, a
@@ -54,9 +51,7 @@ class Generate(ModelCommand, options.ReadOptions):
     no_footing: bool = False
     """Leave out the foot clean-up. Without a refiner, each frame is then sampled given that toes stand where its
     contact bits are 1: feet slide about as mocap's do, and it is faster."""
-    rig: options.OutRig = "canonical"
-    """Body that moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by name
-    or TOML file, whose joints get the canonical bones."""
+    rig: options.BodyRig = "canonical"
     to: Annotated[str, arg(metavar=".bvh|.npz|.glb|...")] = ".bvh"
     """Format of the clips by its ending; a character of --rig is written with them where the ending is its own.
     Only .bvh is written as it is sampled, the others take memory for the whole clip."""
@@ -76,7 +71,7 @@ def run(command: Generate) -> int:
         prior = prior.conditioned_on(names)
         settings = replace(settings, vary_paces=not {*names} & {*PACES, *map(label_pace, PACES)})
     refiner = None if command.refiner is None else priors.refiner_of(command.prior, command.refiner)
-    character = read_character(command.rig, command)
+    character = inputs.read_character(command.rig, command)
     if settings.foot_cleanup is not None:
         footing = replace(settings.foot_cleanup.footing, rest_height=character.toe_rest_height)
         settings = replace(settings, foot_cleanup=replace(settings.foot_cleanup, footing=footing))
@@ -86,7 +81,7 @@ def run(command: Generate) -> int:
     starts = sample_stratified_starts(prior, command.count, torch.Generator().manual_seed(command.seed))
     # A seed for each clip; the first ones do not depend on the count.
     seeds = torch.randint(2**62, (command.count,), generator=torch.Generator().manual_seed(command.seed)).tolist()
-    with outputs.make_folder(command.out) as folder, explain_progress(command.count, "clips") as finished:
+    with outputs.make_folder(command.out) as folder, outputs.explain_progress(command.count, "clips") as finished:
         for number, seed in enumerate(seeds):
             own = settings if settings.start is not None else replace(settings, start=starts[number])
             pieces = draw(generator=torch.Generator().manual_seed(seed), settings=own)
@@ -122,7 +117,7 @@ def _check_settings(command: Generate) -> tuple[GenerateSettings, Motion | None]
 
 def _write(command: Generate, pieces: Iterable[Motion], path: Path, frames: int) -> None:
     began, done = time.perf_counter(), list[Motion]()
-    with show_progress(path.name, quiet=command.quiet) as progress:
+    with outputs.show_progress(path.name, quiet=command.quiet) as progress:
         for piece in pieces:
             done.append(piece)
             if progress is not None:

@@ -14,7 +14,6 @@ from controllers.inbetweening.proposers import build_inbetweener
 from mapctl import curves
 from mapctl.commands.shared import inputs, options, results
 from mapctl.commands.shared.command import ModelCommand, conclude
-from mapctl.commands.shared.options import parse_ranges
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
 from mapctl.recording.inspection import find_gaps
@@ -55,12 +54,10 @@ class Infill(ModelCommand, options.RigOptions, options.ProposalOptions):
     """Seed of what rollouts sample."""
     strict: bool = False
     """Exit with status 3 where not all that was requested holds."""
-    quiet: bool = False
-    """No summary and no progress bar."""
+    quiet: options.Quiet = False
 
 
 def run(command: Infill) -> int:
-    """Check everything, fill, write, report."""
     options.check_seed(command.seed)
     if command.way and command.curve is not None:
         raise RequestError("--way and --curve both give the hips' trajectory; choose one")
@@ -73,9 +70,10 @@ def run(command: Infill) -> int:
     rig = inputs.read_rig(command.rig, command)
     motion, marked, has_gaps = inputs.read_motion_with_gaps(command.source, rig, quiet=command.quiet)
     fps, frames = float(motion.fps), motion.num_frames
-    ways = [Mask(ROOT, *way) for way in parse_ranges(command.way, fps=fps, frames=frames, what="way")]
-    gaps = parse_ranges(command.gap, fps=fps, frames=frames) or ([(0, frames)] if command.joints is not None else [])
-    names = [ALL] if command.joints is None else [name.strip() for name in command.joints.split(",")]
+    ways = [Mask(ROOT, *way) for way in options.parse_ranges(command.way, fps=fps, frames=frames, what="way")]
+    gaps, names = options.parse_ranges(command.gap, fps=fps, frames=frames), [ALL]
+    if command.joints is not None:
+        gaps, names = gaps or [(0, frames)], [name.strip() for name in command.joints.split(",")]
     masks = (*marked, *(Mask(name, *gap) for gap in gaps for name in names))
     if not (masks or has_gaps or ways):
         masks = find_gaps(motion)

@@ -13,7 +13,6 @@ import scenes
 from mapctl import formats, report, retarget
 from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.command import ModelCommand
-from mapctl.commands.shared.outputs import print_table
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.formats import bvh
@@ -50,7 +49,6 @@ _UNITS = {metres: name for name, metres in UNITS.items()}
 
 
 def run(command: Info) -> int:
-    """Collect and print."""
     if command.name is not None and formats.ending_of(command.name) in formats.READERS:
         _print_clip(Path(command.name), command)
     elif command.out is not None:
@@ -129,14 +127,14 @@ def _print_tables(found: Mapping[str, Any], sets: Mapping[str, Any], current: st
         data = f"{row['data']['clips']:,} clips, {minutes:,.0f} min" if minutes else "-"
         rows.append([row["name"], row["kind"], f"{row['megabytes']:.1f} MB", speeds, data, row["licence"]])
     columns = ["prior", "kind", "size", "speeds", "data", "licence of the weights"]
-    print_table(columns, rows or [["none is bundled", *[None] * (len(columns) - 1)]])
+    outputs.print_table(columns, rows or [["none is bundled", *[None] * (len(columns) - 1)]])
     rows = []
     for name, one in sets.items():
         count = len(one["models"])
         about = [str(count), f"{one['megabytes']:.1f} MB", one["licence"]] if count else ["none is bundled", "-", "-"]
         rows.append([f"{name} (in force)" if name == current else name, *about])
-    print_table(["weights", "models", "size", "licence"], rows)
-    print_table(["installation", ""], [[name, str(value)] for name, value in found["installation"].items()])
+    outputs.print_table(["weights", "models", "size", "licence"], rows)
+    outputs.print_table(["installation", ""], [[name, str(value)] for name, value in found["installation"].items()])
     print(NOTICE)
 
 
@@ -221,20 +219,16 @@ def _print(described: dict[str, Any], *, as_json: bool) -> None:
     shown["unit"] = f"{_UNITS[metres]} ({metres:g} m)" if metres in _UNITS else f"{metres:g} m"
     if len(described.get("up", "")) == 1:
         shown["up"] = f"+{described['up']}"
-    print_table(["clip", ""], [[key.replace("_", " "), str(value)] for key, value in shown.items()])
+    outputs.print_table(["clip", ""], [[key.replace("_", " "), str(value)] for key, value in shown.items()])
     for kind in ("skeletons", "animations"):
         if choices := described.get(kind):
-            rows = [
-                [
-                    one["name"],
-                    f"{one['seconds']:.2f} s" if "seconds" in one else "",
-                    "read" if one["read"] else one["choose"],
-                ]
-                for one in choices
-            ]
-            print_table([kind, "", "read, or chosen by"], rows)
+            rows = []
+            for one in choices:
+                seconds = f"{one['seconds']:.2f} s" if "seconds" in one else ""
+                rows.append([one["name"], seconds, "read" if one["read"] else one["choose"]])
+            outputs.print_table([kind, "", "read, or chosen by"], rows)
     if described["joints"]:
-        print_table(["canonical", "joint of the rig"], [[c, own] for c, own in described["joints"].items()])
+        outputs.print_table(["canonical", "joint of the rig"], [[c, own] for c, own in described["joints"].items()])
     print(f"not canonical ({len(described['unmapped'])}): {', '.join(described['unmapped']) or 'none'}")
     print(f"fit: {described['fit']}")
     if described["fit"] == "doubtful":  # the reason why a rig is refused is on standard error

@@ -11,10 +11,8 @@ from torch import Tensor
 from tyro.conf import Positional, arg
 
 from mapctl import curves, editing, formats, metrics, report, retarget
-from mapctl.commands.shared import inputs, options
+from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.command import ModelCommand
-from mapctl.commands.shared.inputs import read_motion
-from mapctl.commands.shared.outputs import format_cell, print_table, show_progress
 from mapctl.errors import CheckpointError, MapctlError, RequestError
 from mapctl.metrics import make_comparable, realism
 from mapctl.motion import Motion
@@ -56,7 +54,6 @@ SETTINGS = realism.RealismSettings()
 
 
 def run(command: Measure) -> int:
-    """Measure and print."""
     folders = [path.is_dir() for path in options.collect_paths(command.clip, command.reference)]
     values = _measure_folders(command) if all(folders) else _measure_clips(command, any(folders))
     if command.json:
@@ -131,10 +128,10 @@ class _ClipSet:
         if not paths:
             raise RequestError(f"{folder}: no {' or '.join(formats.READERS)} file in this folder or below it")
         found = _ClipSet([], [], {}, [])
-        with show_progress(f"reading {folder}") as progress:
+        with outputs.show_progress(f"reading {folder}") as progress:
             for number, path in enumerate(paths, start=1):
                 try:
-                    motion, notes = _make_comparable(read_motion(path, rig), path, rig)
+                    motion, notes = _make_comparable(inputs.read_motion(path, rig), path, rig)
                     windows = [realism.cut_windows(realism.canonical_positions(motion))] if with_windows else []
                     found.measures.append(metrics.measure(motion))
                     found.windows.extend(windows)
@@ -174,7 +171,7 @@ def _measure_folders(command: Measure) -> dict[str, Any]:
         return values
     reference = _ClipSet.read(command.reference, with_windows=True)
     generator = torch.Generator().manual_seed(0)
-    with show_progress("comparing") as progress:
+    with outputs.show_progress("comparing") as progress:
         compared = realism.measure_window_realism(
             ours.windows, reference.windows, generator=generator, settings=SETTINGS, progress=progress
         )
@@ -200,7 +197,7 @@ def _print_tables(values: Mapping[str, Any]) -> None:
     title = None if "clips" not in values else f"over {values['clips']} clips"
     if "reference_clips" in values:
         title = f"{title}, and over {values['reference_clips']} of the reference"
-    print_table(["measure", *columns, "mocap (2 to 98 %)"], rows, title=title)
+    outputs.print_table(["measure", *columns, "mocap (2 to 98 %)"], rows, title=title)
     if "realism" in values:
         _print_realism(values["realism"])
     if "cycle" in values:
@@ -235,7 +232,7 @@ def _print_realism(realism: Mapping[str, Any]) -> None:
         ["Frechet distance", realism["frechet"], realism["floor_frechet"]],
     ]
     columns = ["realism", "ours against the reference", "halves of the reference (floor)"]
-    print_table(columns, rows, title=f"{counts}; 50 % is chance")
+    outputs.print_table(columns, rows, title=f"{counts}; 50 % is chance")
 
 
 def _read_mocap_values() -> Mapping[str, Any]:
@@ -251,4 +248,5 @@ def _read_mocap_values() -> Mapping[str, Any]:
 def _format_range(values: Mapping[str, float] | None) -> str | None:
     if values is None:
         return None
-    return f"{format_cell(values['mean'])} ({format_cell(values['p2'])} to {format_cell(values['p98'])})"
+    mean, low, high = (outputs.format_cell(values[name]) for name in ("mean", "p2", "p98"))
+    return f"{mean} ({low} to {high})"

@@ -8,7 +8,6 @@ from tyro.conf import arg
 from mapctl import curves
 from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.command import Command
-from mapctl.commands.shared.outputs import show_progress
 from mapctl.curves import Curve
 from mapctl.motion import Motion
 from mapctl.retarget import put_upright
@@ -43,14 +42,13 @@ class Render(Command, options.RigOptions):
 
 
 def run(command: Render) -> int:
-    """Check, film, report."""
     size = options.parse_size(command.size)
     outputs.check_film(command.out, size)
     curve = None if command.curve is None else curves.read(command.curve, metres_per_unit=command.metres_per_unit)
     rig = inputs.read_rig(command.rig, command)
     motion = inputs.read_motion(command.source, rig, quiet=command.quiet)
     shot, notes = _prepare_shot(motion, rig, curve, command.character)
-    with show_progress("filming", quiet=command.quiet) as progress:
+    with outputs.show_progress("filming", quiet=command.quiet) as progress:
         camera = CameraSettings(command.camera)
         film([shot], command.out, camera=camera, size=size, progress=progress)
     if not command.quiet:

@@ -12,10 +12,8 @@ from tyro.conf import Positional, arg
 import priors
 import scenes
 from mapctl import report
-from mapctl.commands.shared import options, outputs
+from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.command import INTERRUPTED, ModelCommand, conclude
-from mapctl.commands.shared.inputs import read_character, read_drawn_character
-from mapctl.commands.shared.outputs import show_progress
 from mapctl.commands.shared.shots import (
     PlayedShot,
     ShotPlan,
@@ -47,8 +45,7 @@ class RunScene(ModelCommand, options.ReadOptions):
     """Number of takes, each with the next seeds; their files are numbered: walk_000.bvh, walk_001.bvh, ..."""
     strict: bool = False
     """Exit with status 3 where not all that was asked of every actor holds."""
-    quiet: bool = False
-    """No summary and no progress bar."""
+    quiet: options.Quiet = False
 
 
 def run(command: RunScene) -> int:
@@ -71,7 +68,7 @@ def _number(scene: SceneDescription, take: int) -> SceneDescription:
 
 
 def _run_scene(command: RunScene, path: Path, scene: SceneDescription, curves: Sequence[Curve]) -> int:
-    read_body, read_drawn = functools.cache(read_character), functools.cache(read_drawn_character)
+    read_body, read_drawn = functools.cache(inputs.read_character), functools.cache(inputs.read_drawn_character)
     prior, plans = priors.load(scene.prior), list[ShotPlan]()
     for actor, curve in zip(scene.actors, curves, strict=True):
         rig = actor.rig and (str(path.parent / actor.rig) if Path(actor.rig).suffix else actor.rig)
@@ -105,7 +102,7 @@ def _solve(command: RunScene, scene: SceneDescription, plans: Sequence[ShotPlan]
         plans = let_others_pass(plans, scene.keep_apart)
     for plan in plans:
         try:
-            with show_progress(plan.actor.name, quiet=command.quiet) as progress:
+            with outputs.show_progress(plan.actor.name, quiet=command.quiet) as progress:
                 done.append(play_shot(plan, done, keep_apart=scene.keep_apart, progress=progress))
         except KeyboardInterrupt:
             if not done:
@@ -145,7 +142,7 @@ def _write(
             stage_actor(done, colour=actor.colour, start_seconds=actor.start_seconds, character=character)
             for actor, done, character in zip(scene.actors, walks, drawn, strict=True)
         ]
-        with show_progress("filming", quiet=command.quiet) as progress:
+        with outputs.show_progress("filming", quiet=command.quiet) as progress:
             props = build_obstacles(walks)
             film(shots, films, camera=scene.camera, size=scene.size, fps=scene.fps, props=props, progress=progress)
         notes = dict.fromkeys(note for shot in shots if shot.drawn is not None for note in shot.drawn.notes)

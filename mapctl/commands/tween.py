@@ -21,8 +21,6 @@ from controllers.inbetweening.tween import measure_keyframe_errors, tween
 from controllers.inbetweening.variations import Source, Tweening, sample_variations
 from mapctl.commands.shared import inputs, options, outputs, results
 from mapctl.commands.shared.command import NOT_SATISFIED, ModelCommand, conclude
-from mapctl.commands.shared.options import parse_frame
-from mapctl.commands.shared.outputs import print_table, show_progress
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.intent.keyframes import KeyRequest, Keys, read_keys
 from mapctl.protocols import Inbetweener
@@ -75,15 +73,13 @@ class Tween(ModelCommand, options.RigOptions, options.ProposalOptions):
     stills of each, under the name of its style."""
     strict: bool = False
     """Exit with status 3 where not all that was requested holds: keys too close in time, limbs out of reach."""
-    quiet: bool = False
-    """No summary and no progress bar."""
+    quiet: options.Quiet = False
 
 
 _IN_STYLE = " in the style of "
 
 
 def run(command: Tween) -> int:
-    """Check everything, generate, write, report."""
     request = read_keys(command.source) if command.source.suffix.lower() == ".toml" else None
     with priors.use_weights(command.weights or (request and request.weights)):
         return _run_request(command, request)
@@ -119,7 +115,7 @@ def _run_request(command: Tween, request: KeyRequest | None) -> int:
         print("".join(f"{note}\n" for note in (*done.notes, *done.gap_notes)), end="")
         if intervals:
             rows = [(i.start, i.stop, i.given, i.suggested, i.reason) for i in intervals]
-            print_table(("key", "next", "given", "suggested", "why"), rows, title="frames between keys")
+            outputs.print_table(("key", "next", "given", "suggested", "why"), rows, title="frames between keys")
     return conclude(done.status, strict=command.strict)
 
 
@@ -167,7 +163,7 @@ def _read_keyframe_clip(command: Tween, request: KeyRequest | None) -> KeyframeC
         weight_sets.note_licence(str(command.source), clip.motion.licence)
         return clip
     motion = inputs.read_motion(command.source, rig, quiet=command.quiet)
-    frames = [parse_frame(word, fps=float(motion.fps)) for word in (command.keyframes or "").split(",")]
+    frames = [options.parse_frame(word, fps=float(motion.fps)) for word in (command.keyframes or "").split(",")]
     if len(set(frames)) == 2 and (command.root_only or command.joints is not None):
         name = "--root-only" if command.root_only else "--joints"
         raise RequestError(f"{name} is about keys between the first and the last, and --keyframes has none there")
@@ -178,9 +174,8 @@ def _read_keyframe_clip(command: Tween, request: KeyRequest | None) -> KeyframeC
 def _run_variations(
     command: Tween, clip: KeyframeClip, make: Tweening, models: ModelLoaders, dna: results.Examples
 ) -> bool:
-    """Generate, write, report; the report lists every file with its energy. Return whether all that was requested
-    holds."""
-    with show_progress("variations", quiet=command.quiet) as progress:
+    """Generate, write, report each file with its energy. Return whether all that was requested holds."""
+    with outputs.show_progress("variations", quiet=command.quiet) as progress:
         first = build_inbetweener(command.method, models)
         source = _choose_source(command, first, dna)
         # Where others are drawn from the density only gives energies.

@@ -191,7 +191,7 @@ def _quaternions(asf: AsfSkeleton, values: np.ndarray, *, degrees: bool) -> Floa
         angles = values[:, columns[::-1]]
         # About fixed axes the first named rotation comes first; about moving ones, last.
         turns[:, bone] = euler.to_quat_xyzw(np.deg2rad(angles) if degrees else angles, axes[::-1])
-    frame = torch.from_numpy(np.array([bone.axis_quat_xyzw for bone in asf.bones])).expand(len(values), -1, 4)
+    frame = torch.from_numpy(np.array([bone.axis_quat_xyzw for bone in asf.bones]))
     about = rotations.multiply(rotations.multiply(frame, torch.from_numpy(turns)), rotations.inverse(frame))
     return rotations.make_sign_continuous(about)
 

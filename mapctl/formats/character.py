@@ -11,19 +11,7 @@ import torch
 
 from mapctl import kinematics, rotations
 from mapctl.errors import MapctlError, RequestError
-from mapctl.formats.parts import (
-    CharacterPath,
-    FoundCharacter,
-    MeshPart,
-    chain_matrices,
-    check_poses,
-    check_size,
-    names_file,
-    nearest_rotations,
-    parse_character_path,
-    split_scale,
-    split_scales,
-)
+from mapctl.formats import parts
 from mapctl.formats.sandbox import Refusal
 from mapctl.formats.text import check_ordinary, warn_once
 from mapctl.formats.units import FASTEST, frame_rate
@@ -73,8 +61,8 @@ class RestFrames:
     @staticmethod
     def of(names: Sequence[str], parents: tuple[int, ...], worlds: Array, outer: Array) -> "RestFrames":
         """Take them from world matrices (joints, 4, 4) at rest. UnevenScaleError names a joint that is stretched."""
-        turns, scales = split_scales(parents, worlds, names)
-        split_scale(outer)
+        turns, scales = parts.split_scales(parents, worlds, names)
+        parts.split_scale(outer)
         quats = rotations.from_matrix(torch.from_numpy(turns)).numpy()
         return RestFrames(tuple(names), parents, worlds[:, :3, 3].copy(), quats, scales, outer)
 
@@ -89,7 +77,7 @@ class RestFrames:
 
     def with_root(self, name: str) -> "RestFrames":
         """Return the same joints below a further one, which at rest is where the frame is that the root is in."""
-        turn, scale = split_scale(self.outer)
+        turn, scale = parts.split_scale(self.outer)
         quat = rotations.from_matrix(torch.from_numpy(turn)).numpy()
         return RestFrames(
             (name, *self.names),
@@ -109,11 +97,9 @@ class RestFrames:
 
     def to_motion(self, worlds: Array, fps: Fraction, skeleton: Skeleton, source: object) -> Motion:
         """Return the motion of world matrices (frames, joints, 4, 4) in the file's joint frames."""
-        turns = torch.from_numpy(nearest_rotations(np.sign(self.scales)[:, None, None] * worlds[..., :3, :3]))
-        world = rotations.multiply(
-            rotations.from_matrix(turns),
-            rotations.inverse(torch.from_numpy(self.quat_xyzw)).expand(*worlds.shape[:2], 4),
-        )
+        turns = torch.from_numpy(parts.nearest_rotations(np.sign(self.scales)[:, None, None] * worlds[..., :3, :3]))
+        rest = torch.from_numpy(self.quat_xyzw)
+        world = rotations.multiply(rotations.from_matrix(turns), rotations.inverse(rest))
         positions = torch.from_numpy(worlds[..., :3, 3].copy())
         local = rotations.make_sign_continuous(kinematics.local_from_world(self.parents, world))
         moving = {}
@@ -127,15 +113,14 @@ class RestFrames:
         """Return translations (frames, joints, 3) and rotations (frames, joints, 4), xyzw, in the file's frames: of
         each joint in its parent's, of the root in the frame that `outer` takes to the world."""
         frames = motion.num_frames
-        rest = torch.from_numpy(self.quat_xyzw).expand(frames, -1, -1)
-        world = rotations.multiply(motion.joint_rotations(), rest)
-        turn, unit = split_scale(self.outer)
+        world = rotations.multiply(motion.joint_rotations(), torch.from_numpy(self.quat_xyzw))
+        turn, unit = parts.split_scale(self.outer)
         base = rotations.from_matrix(torch.from_numpy(turn)).expand(frames, 4)
         origin, positions = torch.from_numpy(self.outer[:3, 3].copy()), motion.joint_positions()
         moved, turned = torch.empty_like(positions), torch.empty_like(world)
         for joint, parent in enumerate(self.parents):
             above = base if parent < 0 else world[:, parent]
-            start = origin.expand(frames, 3) if parent < 0 else positions[:, parent]
+            start = origin if parent < 0 else positions[:, parent]
             back, scale = rotations.inverse(above), unit if parent < 0 else self.scales[parent]
             moved[:, joint] = rotations.rotate(back, positions[:, joint] - start) / scale
             turned[:, joint] = rotations.multiply(back, world[:, joint])
@@ -223,7 +208,7 @@ class CharacterSource:
     """Seconds by name of the file's animations of this armature; empty where its rest pose was requested."""
 
     @staticmethod
-    def of(chosen: CharacterPath, found: FoundCharacter, frames: RestFrames) -> "CharacterSource":
+    def of(chosen: parts.CharacterPath, found: parts.FoundCharacter, frames: RestFrames) -> "CharacterSource":
         """Return the source of a motion of what was found in a file; log which animation was read where there are
         others and the path chooses none."""
         others = [name for name in found.animations if name != found.animation]
@@ -277,7 +262,7 @@ def _family(ending: str) -> str:
     return _FAMILIES.get(ending.lower(), ending.lower())
 
 
-Reader = Callable[..., FoundCharacter]
+Reader = Callable[..., parts.FoundCharacter]
 """Reads what is chosen of a file by `armature` and `animation`, and of it what is `wanted`: motion, rest or mesh."""
 
 
@@ -288,7 +273,7 @@ def load_motion(path: str | PathLike[str], read: Reader) -> Motion:
     moves the armature is read, and a file of several armatures is refused, naming them. Joint frames are aligned with
     the world in the rest pose. FileFormatError names the fault of the file.
     """
-    with names_file(path):
+    with parts.names_file(path):
         found, frames, skeleton, source = _read(path, read, "motion")
         fps, worlds = found.motion or _place_poses(found) or (_DEFAULT_FPS, frames.matrices()[None])
         return replace(frames.to_motion(worlds, fps, skeleton, source), licence=found.licence)
@@ -296,7 +281,7 @@ def load_motion(path: str | PathLike[str], read: Reader) -> Motion:
 
 def load_rest(path: str | PathLike[str], read: Reader) -> Motion:
     """Read one frame of the rest pose, as `load_motion` reads an animation."""
-    with names_file(path):
+    with parts.names_file(path):
         _, frames, skeleton, source = _read(path, read, "rest")
         return frames.to_motion(frames.matrices()[None], _DEFAULT_FPS, skeleton, source)
 
@@ -304,7 +289,7 @@ def load_rest(path: str | PathLike[str], read: Reader) -> Motion:
 def load_mesh(path: str | PathLike[str], read: Reader) -> CharacterMesh:
     """Read the triangles in the rest pose: what the armature's skins carry, and what hangs on its joints rigidly.
     `path` chooses as in `load_motion`. FileFormatError where the armature has none, or they are broken."""
-    with names_file(path):
+    with parts.names_file(path):
         found, frames, _, _ = _read(path, read, "mesh")
         meshes = [_build_part(part, frames) for part in found.parts if len(part.faces)]
         if not meshes:
@@ -314,8 +299,8 @@ def load_mesh(path: str | PathLike[str], read: Reader) -> CharacterMesh:
 
 def _read(
     path: str | PathLike[str], read: Reader, wanted: str
-) -> tuple[FoundCharacter, RestFrames, Skeleton, CharacterSource]:
-    chosen = parse_character_path(path)
+) -> tuple[parts.FoundCharacter, RestFrames, Skeleton, CharacterSource]:
+    chosen = parts.parse_character_path(path)
     check_ordinary(chosen.file)
     found = read(chosen.file, armature=chosen.armature, animation=chosen.animation, wanted=wanted)
     if found.fault:
@@ -326,39 +311,39 @@ def _read(
     return found, frames, frames.skeleton(tips), CharacterSource.of(chosen, found, frames)
 
 
-def _place_poses(found: FoundCharacter) -> tuple[Fraction, Array] | None:
+def _place_poses(found: parts.FoundCharacter) -> tuple[Fraction, Array] | None:
     """Return frames per second and world matrices (frames, joints, 4, 4); None where no poses were read."""
     poses = found.poses
     if poses is None:
         return None
     local, outer = poses.local, poses.outer
-    check_size(outer)
+    parts.check_size(outer)
     fps = frame_rate_of(poses.per_second)
     if poses.seconds is not None:
         fps, times = _choose_times(poses.seconds, poses.per_second, len(found.names))
         local = _interpolate(poses.seconds, local, times)
         if len(outer) > 1:
-            split = [split_scale(matrix) for matrix in outer]
+            split = [parts.split_scale(matrix) for matrix in outer]
             turns = rotations.from_matrix(torch.from_numpy(np.array([turn for turn, _ in split]))).numpy()
             scales = np.repeat([[scale] for _, scale in split], 3, axis=1)
             moved = np.concatenate([outer[:, :3, 3], turns, scales], axis=1)[:, None]
             outer = compose_transforms(_interpolate(poses.seconds, moved, times))[:, 0]
     for above in np.moveaxis(compose_transforms(poses.above), 1, 0):
         outer = outer @ above
-    return fps, chain_matrices(found.parents, compose_transforms(local), outer)
+    return fps, parts.chain_matrices(found.parents, compose_transforms(local), outer)
 
 
 def _choose_times(seconds: Array, per_second: float, joints: int) -> tuple[Fraction, Array]:
     """Return frames per second and the frames' times: the time codes, where all samples lie on them. Refusal where
     there would be too many."""
-    check_poses(int(min(seconds[-1] - seconds[0], 1e15)), joints)
+    parts.check_poses(int(min(seconds[-1] - seconds[0], 1e15)), joints)
     codes = seconds * per_second
     if per_second <= _FASTEST_CODES and np.abs(codes - np.rint(codes)).max() < 1e-4:
         count = int(min(np.rint(codes[-1]) - np.rint(codes[0]) + 1, 1e15))
-        check_poses(count, joints)
+        parts.check_poses(count, joints)
         return frame_rate_of(per_second), (round(codes[0]) + np.arange(count)) / per_second
     fps, times = sample_times(seconds)
-    check_poses(len(times), joints)
+    parts.check_poses(len(times), joints)
     return fps, times
 
 
@@ -379,7 +364,7 @@ def _interpolate(keys: Array, values: Array, times: Array) -> Array:
     return done
 
 
-def _build_part(part: MeshPart, frames: RestFrames) -> CharacterMesh:
+def _build_part(part: parts.MeshPart, frames: RestFrames) -> CharacterMesh:
     count = len(part.points)
     if count > _MAX_VERTICES:
         raise Refusal(f"a mesh has {count} vertices, allowed are {_MAX_VERTICES}")

@@ -10,29 +10,7 @@ from typing import Any
 import numpy as np
 import ufbx
 
-from mapctl.formats import sandbox
-from mapctl.formats.parts import (
-    GREY,
-    MAX_CORNERS,
-    MAX_JOINTS,
-    Armature,
-    FoundCharacter,
-    MeshPart,
-    Poses,
-    check_poses,
-    check_size,
-    choose_armature,
-    complete_bind_pose,
-    decode_picture,
-    decode_srgb,
-    encode_srgb,
-    find_name,
-    make_unique,
-    mean_at_vertices,
-    sample_picture,
-    split_polygons,
-    strongest,
-)
+from mapctl.formats import parts, sandbox
 from mapctl.formats.sandbox import Refusal
 
 Array = np.ndarray
@@ -47,25 +25,25 @@ _MOVED = ("Lcl Translation", "Lcl Rotation", "Lcl Scaling")
 _kept: list[object] = []
 
 
-def read_character(path: Path, **choice: str | None) -> FoundCharacter:
+def read_character(path: Path, **choice: str | None) -> parts.FoundCharacter:
     """Read a character in a sandbox: see `find_character`."""
     return sandbox.call(find_character, path, **choice)
 
 
-def find_character(path: str, *, armature: str | None, animation: str | None, wanted: str) -> FoundCharacter:
+def find_character(path: str, *, armature: str | None, animation: str | None, wanted: str) -> parts.FoundCharacter:
     """Read an armature, and `wanted` besides: `rest` nothing, `motion` its animation, `mesh` its triangles. Refusal
     gives the reason.
 
     The rest pose is the one in which skins are bound where bones are as long as the nodes', else the nodes'.
     """
     scene, fault = open_scene(path, with_mesh=wanted == "mesh")
-    listed, own = choose_armature(path, find_armatures(scene), armature)
-    root, names = own.nodes[0], make_unique([node.name or f"node_{node.typed_id}" for node in own.nodes])
+    listed, own = parts.choose_armature(path, find_armatures(scene), armature)
+    root, names = own.nodes[0], parts.make_unique([node.name or f"node_{node.typed_id}" for node in own.nodes])
     worlds = np.stack([to_matrix(node.node_to_world) for node in own.nodes])
     bound = _read_bind_poses(scene, own)
-    check_size(worlds, *(matrix for pose in bound for matrix in pose.values()))
-    complete = complete_bind_pose(own.parents, bound, worlds)
-    found = FoundCharacter(
+    parts.check_size(worlds, *(matrix for pose in bound for matrix in pose.values()))
+    complete = parts.complete_bind_pose(own.parents, bound, worlds)
+    found = parts.FoundCharacter(
         armature=own.name,
         armatures=listed,
         names=names,
@@ -83,7 +61,7 @@ def find_character(path: str, *, armature: str | None, animation: str | None, wa
         found.animation = next(iter(takes), None) if animation is None else animation
         if animation is not None and animation not in takes:
             every = _list_takes(scene)
-            find_name("", list(every), animation, "animation")
+            parts.find_name("", list(every), animation, "animation")
             raise Refusal(f"animation {animation!r} does not move {own.name!r}")
         if found.animation is not None:
             found.poses = _sample(scene, found.animation, *takes[found.animation], own)
@@ -181,7 +159,7 @@ def to_matrix(columns: ufbx.Matrix) -> Array:
     return matrix
 
 
-def find_armatures(scene: ufbx.Scene) -> list[Armature[ufbx.Node]]:
+def find_armatures(scene: ufbx.Scene) -> list[parts.Armature[ufbx.Node]]:
     """Find the armatures of a file, in its order. Refusal where it has none."""
     bones = _find_bones(scene)
     if not bones:
@@ -189,7 +167,7 @@ def find_armatures(scene: ufbx.Scene) -> list[Armature[ufbx.Node]]:
     return [_build(scene, group, bones) for group in _group(scene, bones)]
 
 
-def _read_bind_poses(scene: ufbx.Scene, armature: Armature[ufbx.Node]) -> list[dict[int, Array]]:
+def _read_bind_poses(scene: ufbx.Scene, armature: parts.Armature[ufbx.Node]) -> list[dict[int, Array]]:
     """Return world matrices (4, 4) by joint of the bind poses of the file: by its skins, and by its bind poses."""
     index_of = {node.typed_id: joint for joint, node in enumerate(armature.nodes)}
     skins: dict[int, Array] = {}
@@ -241,7 +219,7 @@ def _group(scene: ufbx.Scene, bones: dict[int, ufbx.Node]) -> list[list[ufbx.Nod
     return [[top for top, own in zip(tops, group, strict=True) if own == one] for one in dict.fromkeys(group)]
 
 
-def _build(scene: ufbx.Scene, tops: list[ufbx.Node], bones: dict[int, ufbx.Node]) -> Armature[ufbx.Node]:
+def _build(scene: ufbx.Scene, tops: list[ufbx.Node], bones: dict[int, ufbx.Node]) -> parts.Armature[ufbx.Node]:
     root = tops[0]
     if len(tops) > 1:  # their deepest common node
         root = scene.root_node
@@ -253,12 +231,14 @@ def _build(scene: ufbx.Scene, tops: list[ufbx.Node], bones: dict[int, ufbx.Node]
     joints = [node for node in walk(root) if node.typed_id in bones or node.typed_id in lines or node is root]
     ends = {above(node).typed_id: node for node in joints if node is not root and _is_end(node)}
     joints = [node for node in joints if node is root or not _is_end(node)]
-    if len(joints) > MAX_JOINTS:
-        raise Refusal(f"has an armature of {len(joints)} joints, allowed are {MAX_JOINTS}")
+    if len(joints) > parts.MAX_JOINTS:
+        raise Refusal(f"has an armature of {len(joints)} joints, allowed are {parts.MAX_JOINTS}")
     index_of = {node.typed_id: index for index, node in enumerate(joints)}
     parents = tuple(-1 if node is root else index_of[above(node).typed_id] for node in joints)
     holder = "" if root.is_root or above(root).is_root else above(root).name
-    return Armature(holder or root.name or "armature", joints, parents, {index_of[k]: node for k, node in ends.items()})
+    return parts.Armature(
+        holder or root.name or "armature", joints, parents, {index_of[k]: node for k, node in ends.items()}
+    )
 
 
 def _is_end(node: ufbx.Node) -> bool:
@@ -273,10 +253,14 @@ def _is_end(node: ufbx.Node) -> bool:
 
 def _list_takes(scene: ufbx.Scene) -> dict[str, ufbx.AnimStack]:
     stacks = each(scene.anim_stacks)
-    return dict(zip(make_unique([stack.name or f"take_{k}" for k, stack in enumerate(stacks)]), stacks, strict=True))
+    return dict(
+        zip(parts.make_unique([stack.name or f"take_{k}" for k, stack in enumerate(stacks)]), stacks, strict=True)
+    )
 
 
-def _name_takes(scene: ufbx.Scene, armature: Armature[ufbx.Node]) -> dict[str, tuple[ufbx.AnimStack, float, float]]:
+def _name_takes(
+    scene: ufbx.Scene, armature: parts.Armature[ufbx.Node]
+) -> dict[str, tuple[ufbx.AnimStack, float, float]]:
     """Return the animations that move the armature or what is above it, with their first and last second, by name."""
     own = {node.element_id for node in [*armature.nodes, *line_of(armature.nodes[0])]}
     takes = _list_takes(scene).items()
@@ -294,15 +278,15 @@ def _moved_nodes(stack: ufbx.AnimStack) -> set[int]:
 
 
 def _sample(
-    scene: ufbx.Scene, name: str, stack: ufbx.AnimStack, begin: float, end: float, armature: Armature[ufbx.Node]
-) -> Poses:
+    scene: ufbx.Scene, name: str, stack: ufbx.AnimStack, begin: float, end: float, armature: parts.Armature[ufbx.Node]
+) -> parts.Poses:
     outer = line_of(armature.nodes[0])[:0:-1]
     rate = scene.settings.frames_per_second
     rate = rate if np.isfinite(rate) and 0.01 <= rate <= 1e5 else _USUAL_RATE
     if not (np.isfinite(begin) and np.isfinite(end)) or end < begin:
         raise Refusal(f"animation {name!r} lasts from {begin:g} to {end:g} s")
     count = np.floor((end - begin) * rate + _EARLY_SHARE) + 1
-    check_poses(count, len(armature.nodes) + len(outer))
+    parts.check_poses(count, len(armature.nodes) + len(outer))
     times = begin + np.arange(int(count)) / rate
     moved = _moved_nodes(stack)
     local = np.stack([_sample_node(stack.anim, node, times, moved) for node in armature.nodes], axis=1)
@@ -310,7 +294,7 @@ def _sample(
     if outer:
         above = np.stack([_sample_node(stack.anim, node, times, moved) for node in outer], axis=1)
     is_moved = bool({node.element_id for node in outer} & moved)
-    return Poses(rate, None, local, np.eye(4)[None], above if is_moved else above[:1])
+    return parts.Poses(rate, None, local, np.eye(4)[None], above if is_moved else above[:1])
 
 
 def _find_range(stack: ufbx.AnimStack, own: set[int]) -> tuple[float, float]:
@@ -340,13 +324,13 @@ def _sample_node(anim: ufbx.Anim, node: ufbx.Node, times: Array, moved: set[int]
     return table if len(table) == len(times) else np.tile(table, (len(times), 1))
 
 
-def _read_parts(scene: ufbx.Scene, armature: Armature[ufbx.Node], folder: Path) -> list[MeshPart]:
+def _read_parts(scene: ufbx.Scene, armature: parts.Armature[ufbx.Node], folder: Path) -> list[parts.MeshPart]:
     """Read what the armature's skins carry, and what hangs on its joints rigidly; pictures lie in `folder` or below."""
     index_of = {node.typed_id: joint for joint, node in enumerate(armature.nodes)}
     found = []
     for mesh in each(scene.meshes):
-        if mesh.num_indices > MAX_CORNERS:
-            raise Refusal(f"mesh {mesh.name!r} has {mesh.num_indices} corners, allowed are {MAX_CORNERS}")
+        if mesh.num_indices > parts.MAX_CORNERS:
+            raise Refusal(f"mesh {mesh.name!r} has {mesh.num_indices} corners, allowed are {parts.MAX_CORNERS}")
         for node in each(mesh.instances):
             carriers = _read_carriers(mesh, node, index_of, armature)
             if carriers is not None and mesh.num_triangles:
@@ -355,7 +339,7 @@ def _read_parts(scene: ufbx.Scene, armature: Armature[ufbx.Node], folder: Path) 
 
 
 def _read_carriers(
-    mesh: ufbx.Mesh, node: ufbx.Node, index_of: dict[int, int], armature: Armature[ufbx.Node]
+    mesh: ufbx.Mesh, node: ufbx.Node, index_of: dict[int, int], armature: parts.Armature[ufbx.Node]
 ) -> tuple[Array, Array, Array, Array] | None:
     """Return joints (m,) and matrices (m, 4, 4) from the mesh to their frames, and by vertex indices among them (n, k)
     and their shares; None where the armature does not carry the mesh."""
@@ -385,14 +369,16 @@ def _read_weights(skin: ufbx.SkinDeformer, count: int) -> tuple[Array, Array]:
         clusters.append(np.full(len(vertices[-1]), number + 1))
     if not vertices:
         return np.zeros((count, 1), np.int64), np.ones((count, 1))
-    return strongest(np.concatenate(vertices), np.concatenate(clusters), np.concatenate(weights), count)
+    return parts.strongest(np.concatenate(vertices), np.concatenate(clusters), np.concatenate(weights), count)
 
 
-def _read_part(mesh: ufbx.Mesh, node: ufbx.Node, carriers: tuple[Array, Array, Array, Array], folder: Path) -> MeshPart:
+def _read_part(
+    mesh: ufbx.Mesh, node: ufbx.Node, carriers: tuple[Array, Array, Array, Array], folder: Path
+) -> parts.MeshPart:
     faces = np.array([(face.index_begin, face.num_indices) for face in mesh.faces], np.int64).reshape(-1, 2)
     begin, counts = faces.T
     shift = begin - (np.cumsum(counts) - counts)  # from corners counted face by face to the mesh's own
-    corners, polygon = split_polygons(counts)
+    corners, polygon = parts.split_polygons(counts)
     corners = corners + shift[polygon][:, None]
     order = np.arange(counts.sum()) + np.repeat(shift, counts)
     material = np.zeros(mesh.num_indices, np.int64)
@@ -400,22 +386,22 @@ def _read_part(mesh: ufbx.Mesh, node: ufbx.Node, carriers: tuple[Array, Array, A
         material[order] = np.repeat(np.array(mesh.face_material, np.int64), counts)
     corner_vertex = np.array(mesh.vertex_indices, np.int64)
     points = np.array(mesh.vertices, np.float64).reshape(-1, 3)
-    rgba = mean_at_vertices(_corner_colours(mesh, node, material, folder), corner_vertex, len(points))
-    return MeshPart(points, corner_vertex[corners], rgba, *carriers)
+    rgba = parts.mean_at_vertices(_corner_colours(mesh, node, material, folder), corner_vertex, len(points))
+    return parts.MeshPart(points, corner_vertex[corners], rgba, *carriers)
 
 
 def _corner_colours(mesh: ufbx.Mesh, node: ufbx.Node, material: Array, folder: Path) -> Array:
     """Return sRGB and opacity at every corner, (corners, 4): of its `material` (corners,), the material's picture and
     the vertices' own."""
     count = mesh.num_indices
-    rgba = np.tile(np.array(GREY), (count, 1))
+    rgba = np.tile(np.array(parts.GREY), (count, 1))
     uv = _corner_values(mesh.vertex_uv, count, 2)
     for number, look in enumerate(each(node.materials) or each(mesh.materials)):
         here = material == number
         rgba[here] = _material_colours(look, None if uv is None else uv[here], int(here.sum()), folder)
     own = _corner_values(mesh.vertex_color, count, 4)
     if own is not None:
-        rgba = np.column_stack([encode_srgb(decode_srgb(rgba[:, :3]) * own[:, :3].clip(0, 1)), rgba[:, 3]])
+        rgba = np.column_stack([parts.encode_srgb(parts.decode_srgb(rgba[:, :3]) * own[:, :3].clip(0, 1)), rgba[:, 3]])
     rgba[:, 3] = 1.0
     return rgba.clip(0.0, 1.0)
 
@@ -430,19 +416,19 @@ def _corner_values(table: ufbx.VertexVec2 | ufbx.VertexVec4, count: int, width: 
 def _material_colours(look: ufbx.Material, uv: Array | None, count: int, folder: Path) -> Array:
     maps = look.fbx.diffuse_color if look.fbx.diffuse_color.has_value else look.pbr.base_color
     factor = look.fbx.diffuse_factor.value_vec4.x if look.fbx.diffuse_factor.has_value else 1.0
-    linear = np.array(maps.value_vec4[:3]) * factor if maps.has_value else np.array(GREY[:3])
+    linear = np.array(maps.value_vec4[:3]) * factor if maps.has_value else np.array(parts.GREY[:3])
     picture = None if uv is None or maps.texture is None else _read_picture(maps.texture, folder)
     if picture is None or uv is None:
-        return np.tile(np.append(encode_srgb(linear), 1.0), (count, 1))
-    return sample_picture(picture, np.column_stack([uv[:, 0], 1.0 - uv[:, 1]]))
+        return np.tile(np.append(parts.encode_srgb(linear), 1.0), (count, 1))
+    return parts.sample_picture(picture, np.column_stack([uv[:, 0], 1.0 - uv[:, 1]]))
 
 
 def _read_picture(texture: ufbx.Texture, folder: Path) -> Array | None:
     """Read the picture within the file, or one in its folder or below; None where it is neither."""
     if texture.content:
-        return decode_picture(texture.content)
+        return parts.decode_picture(texture.content)
     for name in (texture.relative_filename, Path(texture.absolute_filename.replace("\\", "/")).name):
         target = (folder / name.replace("\\", "/").replace("\0", "?")).resolve()
         if name and target.is_relative_to(folder) and target.is_file():
-            return decode_picture(target.read_bytes())
+            return parts.decode_picture(target.read_bytes())
     return None

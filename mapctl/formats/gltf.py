@@ -27,28 +27,10 @@ import torch
 
 from mapctl import kinematics, rotations
 from mapctl.errors import RequestError
+from mapctl.formats import parts
 from mapctl.formats.atomic import write_pieces
 from mapctl.formats.bvh import check_finite
 from mapctl.formats.character import CharacterSource, build_skinned_body, character_of, compose_matrices, sample_times
-from mapctl.formats.parts import (
-    MAX_JOINTS,
-    Armature,
-    FoundCharacter,
-    MeshPart,
-    chain_matrices,
-    check_poses,
-    choose_armature,
-    complete_bind_pose,
-    decode_picture,
-    decode_srgb,
-    encode_srgb,
-    find_name,
-    make_unique,
-    names_file,
-    sample_picture,
-    share_out,
-    split_scale,
-)
 from mapctl.formats.sandbox import Refusal
 from mapctl.formats.text import MAX_FILE_BYTES, check_ordinary, one_line, read_bytes, shorten, warn_once
 from mapctl.motion import Motion
@@ -92,7 +74,7 @@ def _refuse_malformed() -> Iterator[None]:
 
 
 @_refuse_malformed()
-def read_character(path: Path, *, armature: str | None, animation: str | None, wanted: str) -> FoundCharacter:
+def read_character(path: Path, *, armature: str | None, animation: str | None, wanted: str) -> parts.FoundCharacter:
     """Read an armature, and `wanted` besides: `rest` nothing, `motion` its animation, `mesh` its triangles. Refusal
     gives the reason.
 
@@ -100,14 +82,14 @@ def read_character(path: Path, *, armature: str | None, animation: str | None, w
     nodes' (VRM files: always the nodes'); else the nodes'.
     """
     gltf = read_file(path)
-    listed, own = choose_armature(path, find_armatures(gltf), armature)
+    listed, own = parts.choose_armature(path, find_armatures(gltf), armature)
     nodes = [gltf.get("nodes", node) for node in own.nodes]
     outer = gltf.chain(gltf.line(own.nodes[0])[1:])
-    worlds = chain_matrices(own.parents, np.stack([_node_matrix(node) for node in nodes]), outer)
+    worlds = parts.chain_matrices(own.parents, np.stack([_node_matrix(node) for node in nodes]), outer)
     is_vrm = any(name in gltf.tree.get("extensions", {}) for name in ("VRM", *_EXTENSIONS))  # whatever its ending
     bound = None if is_vrm else _bind_worlds(gltf, own, worlds, outer)
-    names = make_unique([str(n.get("name") or f"node_{k}") for n, k in zip(nodes, own.nodes, strict=True)])
-    found = FoundCharacter(
+    names = parts.make_unique([str(n.get("name") or f"node_{k}") for n, k in zip(nodes, own.nodes, strict=True)])
+    found = parts.FoundCharacter(
         armature=own.name,
         armatures=listed,
         names=names,
@@ -134,10 +116,10 @@ def _name_bones(gltf: "Gltf", names: Mapping[int, str]) -> dict[str, str]:
     return {bone: name for bone, name in bones.items() if bone in CANONICAL.names}
 
 
-def _read_motion(gltf: "Gltf", armature: Armature[int], wanted: str | None, found: FoundCharacter) -> None:
+def _read_motion(gltf: "Gltf", armature: parts.Armature[int], wanted: str | None, found: parts.FoundCharacter) -> None:
     """Add the wanted animation, else the first that moves the armature, to what was found."""
     names = _name_animations(gltf)
-    numbers = range(len(names)) if wanted is None else [find_name("", names, wanted, "animation")]
+    numbers = range(len(names)) if wanted is None else [parts.find_name("", names, wanted, "animation")]
     read = ((names[number], _read_tracks(gltf, number, armature.nodes)) for number in numbers)
     name, tracks = next((own for own in read if own[1]), (None, []))
     if name is None:
@@ -146,7 +128,7 @@ def _read_motion(gltf: "Gltf", armature: Armature[int], wanted: str | None, foun
         return
     found.animation, found.animations = name, _time_animations(gltf, armature.nodes)
     fps, local = _sample_tracks(gltf, armature.nodes, tracks)
-    found.motion = fps, chain_matrices(armature.parents, local, found.outer)
+    found.motion = fps, parts.chain_matrices(armature.parents, local, found.outer)
     extras = gltf.tree["asset"].get("extras")
     licence = extras.get(LICENCE) if isinstance(extras, dict) else None
     found.licence = licence if isinstance(licence, str) else ""
@@ -187,8 +169,8 @@ class Gltf:
         found = [node]
         while found[-1] in self.parent:
             found.append(self.parent[found[-1]])
-            if len(found) > MAX_JOINTS:
-                raise Refusal(f"nodes[{node}] is below itself, or below more than {MAX_JOINTS} others")
+            if len(found) > parts.MAX_JOINTS:
+                raise Refusal(f"nodes[{node}] is below itself, or below more than {parts.MAX_JOINTS} others")
         return found
 
     def connect(self, nodes: Iterable[int]) -> list[int]:
@@ -366,7 +348,7 @@ def _read_table(gltf: Gltf, entry: Json, shape: tuple[int, int], dtype: np.dtype
     return np.ndarray(shape, dtype, data, offset, (stride, dtype.itemsize))
 
 
-def _bind_worlds(gltf: Gltf, armature: Armature[int], worlds: Array, outer: Array) -> Array | None:
+def _bind_worlds(gltf: Gltf, armature: parts.Armature[int], worlds: Array, outer: Array) -> Array | None:
     """Return world matrices (joints, 4, 4) of the pose in which the skins are bound, as far as they agree with the
     nodes' bones; None where they do not, or are not said.
 
@@ -381,7 +363,7 @@ def _bind_worlds(gltf: Gltf, armature: Armature[int], worlds: Array, outer: Arra
         for node, matrix in zip(gltf.get("skins", number)["joints"], inverse, strict=True):
             bound.setdefault(index_of[node], np.linalg.inv(matrix))  # a ValueError where it is singular
     spaces = ({joint: space @ matrix for joint, matrix in bound.items()} for space in (np.eye(4), outer))
-    return complete_bind_pose(armature.parents, spaces, worlds)
+    return parts.complete_bind_pose(armature.parents, spaces, worlds)
 
 
 def _read_inverse_binds(gltf: Gltf, skin: int) -> Array | None:
@@ -398,10 +380,10 @@ def _read_inverse_binds(gltf: Gltf, skin: int) -> Array | None:
 
 def _node_parts(node: Json) -> dict[str, Array]:
     """Return translation (3,), rotation xyzw (4,) and scale (3,) of a node without a matrix."""
-    parts = {key: np.array(node.get(key, usual), np.float64) for key, usual in _AT_REST.items()}
-    if any(part.shape != (len(_AT_REST[key]),) for key, part in parts.items()):
+    placed = {key: np.array(node.get(key, usual), np.float64) for key, usual in _AT_REST.items()}
+    if any(part.shape != (len(_AT_REST[key]),) for key, part in placed.items()):
         raise ValueError("a node's translation and scale have 3 numbers, its rotation 4")
-    return parts
+    return placed
 
 
 def _node_matrix(node: Json) -> Array:
@@ -425,7 +407,7 @@ def read_bones(gltf: Gltf) -> dict[str, int]:
     return {bone["bone"]: bone["node"] for bone in bones}
 
 
-def find_armatures(gltf: Gltf) -> list[Armature[int]]:
+def find_armatures(gltf: Gltf) -> list[parts.Armature[int]]:
     """Find the armatures of a file; Refusal where nothing marks nodes as joints, or they are no tree."""
     skins, groups = gltf.all("skins"), list[tuple[set[int], list[int]]]()
     targets = [c["target"] for animation in gltf.all("animations") for c in animation.get("channels", ())]
@@ -467,7 +449,7 @@ def _find_bare_joints(gltf: Gltf, animated: set[int]) -> list[set[int]]:
     return [{n for n in below if n in moved or gltf.get("nodes", n).get("children")} for moved, below in walks]
 
 
-def _build_armature(gltf: Gltf, joints: set[int], skins: list[int], animated: set[int]) -> Armature[int]:
+def _build_armature(gltf: Gltf, joints: set[int], skins: list[int], animated: set[int]) -> parts.Armature[int]:
     """Build the tree of a group's joints; its root is the topmost node above them that any animation moves."""
     nodes, bones = gltf.all("nodes"), set(read_bones(gltf).values())
     own = gltf.connect(joints)
@@ -476,8 +458,8 @@ def _build_armature(gltf: Gltf, joints: set[int], skins: list[int], animated: se
     if moved:
         wanted |= {node for node in gltf.line(own[0]) if moved[-1] in gltf.line(node)}
     order = [node for node in gltf.walk(moved[-1] if moved else own[0]) if node in wanted]
-    if len(order) > MAX_JOINTS:
-        raise Refusal(f"an armature has {len(order)} joints, allowed are {MAX_JOINTS}")
+    if len(order) > parts.MAX_JOINTS:
+        raise Refusal(f"an armature has {len(order)} joints, allowed are {parts.MAX_JOINTS}")
     index_of = {node: index for index, node in enumerate(order)}
     parents = tuple(-1 if node == order[0] else index_of[gltf.parent[node]] for node in order)
     ends = {}
@@ -489,7 +471,7 @@ def _build_armature(gltf: Gltf, joints: set[int], skins: list[int], animated: se
     above = [nodes[k] for k in (gltf.parent.get(order[0]), order[0]) if k is not None]  # exporters name it there
     named = [*(gltf.get("skins", skin) for skin in skins[:1]), *above]
     name = next((str(one["name"]) for one in named if one.get("name")), f"armature_{order[0]}")
-    return Armature(name, order, parents, ends, skins)
+    return parts.Armature(name, order, parents, ends, skins)
 
 
 @dataclass(frozen=True, eq=False)
@@ -528,7 +510,7 @@ class Track:
 
 
 def _name_animations(gltf: Gltf) -> list[str]:
-    return make_unique([str(a.get("name") or f"animation_{k}") for k, a in enumerate(gltf.all("animations"))])
+    return parts.make_unique([str(a.get("name") or f"animation_{k}") for k, a in enumerate(gltf.all("animations"))])
 
 
 def _time_animations(gltf: Gltf, nodes: Sequence[int]) -> dict[str, float]:
@@ -582,9 +564,9 @@ def _sample_tracks(gltf: Gltf, nodes: Sequence[int], tracks: Sequence[Track]) ->
     Refusal where there would be too many.
     """
     keys = np.concatenate([track.times for track in tracks])
-    check_poses(int(keys.max() - keys.min()), 1)
+    parts.check_poses(int(keys.max() - keys.min()), 1)
     fps, times = sample_times(keys)
-    check_poses(len(times), len(nodes))
+    parts.check_poses(len(times), len(nodes))
     moved = {track.node for track in tracks}
     matrices = np.empty((len(times), len(nodes), 4, 4))
     for number, node in enumerate(nodes):
@@ -592,15 +574,15 @@ def _sample_tracks(gltf: Gltf, nodes: Sequence[int], tracks: Sequence[Track]) ->
         if node not in moved:
             matrices[:, number] = _node_matrix(own)
             continue
-        parts = {path: np.tile(values, (len(times), 1)) for path, values in _node_parts(own).items()}
-        parts |= {track.path: track.sample(times) for track in tracks if track.node == node}
-        lengths = np.linalg.norm(parts["rotation"], axis=1, keepdims=True)
-        turns = np.where(lengths > 1e-9, parts["rotation"] / np.maximum(lengths, 1e-9), _AT_REST["rotation"])
-        matrices[:, number] = compose_matrices(parts["translation"], turns, parts["scale"])
+        placed = {path: np.tile(values, (len(times), 1)) for path, values in _node_parts(own).items()}
+        placed |= {track.path: track.sample(times) for track in tracks if track.node == node}
+        lengths = np.linalg.norm(placed["rotation"], axis=1, keepdims=True)
+        turns = np.where(lengths > 1e-9, placed["rotation"] / np.maximum(lengths, 1e-9), _AT_REST["rotation"])
+        matrices[:, number] = compose_matrices(placed["translation"], turns, placed["scale"])
     return fps, matrices
 
 
-def _read_parts(gltf: Gltf, armature: Armature[int]) -> Iterator[MeshPart]:
+def _read_parts(gltf: Gltf, armature: parts.Armature[int]) -> Iterator[parts.MeshPart]:
     """Read what the armature's skins carry, and what hangs on its joints rigidly."""
     index_of = {node: joint for joint, node in enumerate(armature.nodes)}
     for number, node in enumerate(gltf.all("nodes")):
@@ -626,7 +608,7 @@ def _read_parts(gltf: Gltf, armature: Armature[int]) -> Iterator[MeshPart]:
             if skin is not None:
                 rows, shares = _read_carriers(gltf, attributes, len(points), what)
             faces, rgba = _read_faces(gltf, primitive, len(points)), _read_colours(gltf, primitive, len(points), what)
-            yield MeshPart(points, faces, rgba, joints, matrices, rows, shares)
+            yield parts.MeshPart(points, faces, rgba, joints, matrices, rows, shares)
 
 
 def _read_carriers(gltf: Gltf, attributes: Json, count: int, what: str) -> tuple[Array, Array]:
@@ -640,7 +622,7 @@ def _read_carriers(gltf: Gltf, attributes: Json, count: int, what: str) -> tuple
     )
     if own.shape != shares.shape or len(own) != count:
         raise Refusal(f"{what} has {count} vertices and {len(own)} rows of joints")
-    return np.where(shares > 0, own, 0).astype(np.int64), share_out(shares.astype(np.float64))
+    return np.where(shares > 0, own, 0).astype(np.int64), parts.share_out(shares.astype(np.float64))
 
 
 def _read_faces(gltf: Gltf, primitive: Json, count: int) -> Array:
@@ -678,18 +660,20 @@ def _read_colours(gltf: Gltf, primitive: Json, count: int, what: str) -> Array:
         where = read_accessor(gltf, attributes[name], "VEC2").astype(np.float64)
         if len(where) != count:
             raise Refusal(f"{name} has {len(where)} rows for {count} vertices")
-        texels = sample_picture(picture, where)
-        linear *= np.column_stack([decode_srgb(texels[:, :3]), texels[:, 3]])
+        texels = parts.sample_picture(picture, where)
+        linear *= np.column_stack([parts.decode_srgb(texels[:, :3]), texels[:, 3]])
     opacity = linear[:, 3:] if material.get("alphaMode") == "BLEND" else np.ones((count, 1))
-    return np.concatenate([encode_srgb(linear[:, :3]), opacity], axis=1).clip(0.0, 1.0)
+    return np.concatenate([parts.encode_srgb(linear[:, :3]), opacity], axis=1).clip(0.0, 1.0)
 
 
 def _read_picture(gltf: Gltf, source: int | None) -> Array | None:
     """Read a picture from its own file or from a view; None where it is neither, or cannot be decoded."""
     image = {} if source is None else gltf.get("images", source)
     if image.get("uri") is not None:
-        return decode_picture(_read_neighbour(gltf.path, image["uri"]))
-    return None if image.get("bufferView") is None else decode_picture(bytes(_read_view(gltf, image["bufferView"])))
+        return parts.decode_picture(_read_neighbour(gltf.path, image["uri"]))
+    return (
+        None if image.get("bufferView") is None else parts.decode_picture(bytes(_read_view(gltf, image["bufferView"])))
+    )
 
 
 def save(motion: Motion, path: str | PathLike[str]) -> None:
@@ -720,7 +704,7 @@ def _save_character(motion: Motion, path: str | PathLike[str], source: Character
     RequestError where the character's file has changed since it was read.
     """
     source.check_unchanged()
-    with names_file(source.path), _refuse_malformed():
+    with parts.names_file(source.path), _refuse_malformed():
         gltf, tree, binary = _gather(source.path)
     appended = _Arrays(tree, sum(len(piece) for piece in binary))
     nodes = [int(node) for node in source.nodes]
@@ -846,9 +830,9 @@ def _beside_own_scale(node: Json, turned: Array) -> Array:
     go with one of -1 along all."""
     own = torch.tensor(node.get("rotation", (0.0, 0.0, 0.0, 1.0)), dtype=torch.float64)
     matrix = compose_matrices(np.zeros(3), own.numpy(), np.array(node["scale"]))
-    rest = rotations.from_matrix(torch.from_numpy(split_scale(matrix, may_mirror=True)[0]))
+    rest = rotations.from_matrix(torch.from_numpy(parts.split_scale(matrix, may_mirror=True)[0]))
     change = rotations.multiply(rotations.inverse(rest), own)
-    return rotations.multiply(torch.from_numpy(turned), change.expand(len(turned), 4)).numpy()
+    return rotations.multiply(torch.from_numpy(turned), change).numpy()
 
 
 def _use_parts(node: Json) -> None:
@@ -856,7 +840,7 @@ def _use_parts(node: Json) -> None:
     if "matrix" not in node:
         return
     matrix = np.array(node.pop("matrix"), np.float64).reshape(4, 4).T
-    turn, scale = split_scale(matrix, may_mirror=True)
+    turn, scale = parts.split_scale(matrix, may_mirror=True)
     node["translation"] = matrix[:3, 3].tolist()
     node["rotation"] = rotations.from_matrix(torch.from_numpy(turn)).tolist()
     node["scale"] = [scale] * 3
@@ -921,7 +905,7 @@ def _add_body(motion: Motion, tree: Json, arrays: _Arrays) -> None:
     columns = {
         "POSITION": body.vertices,
         "NORMAL": body.normals,
-        "COLOR_0": decode_srgb(body.rgba[:, :3]),
+        "COLOR_0": parts.decode_srgb(body.rgba[:, :3]),
         "JOINTS_0": np.pad(body.joints, missing).astype(np.uint16),
         "WEIGHTS_0": weight,
     }
@@ -995,8 +979,7 @@ def _select_bones(motion: Motion, bones: Mapping[str, int], path: str | PathLike
         flip = torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64)
         offsets, positions, height = offsets * flip, positions * flip, height * flip
         ends = {name: (-x, y, -z) for name, (x, y, z) in ends.items()}
-        turn = _HALF_TURN.expand_as(world)
-        world = rotations.multiply(rotations.multiply(turn, world), rotations.inverse(turn))
+        world = rotations.multiply(rotations.multiply(_HALF_TURN, world), rotations.inverse(_HALF_TURN))
     local = rotations.make_sign_continuous(kinematics.local_from_world(tuple(parents), world))
     skeleton = Skeleton(tuple(whole.names[joint] for joint in joints), tuple(parents), offsets, ends)
     body = Motion(skeleton, motion.fps, positions[:, 0].clone(), local, licence=motion.licence)

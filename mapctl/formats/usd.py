@@ -20,31 +20,7 @@ import numpy as np
 from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils, Vt
 from scipy.spatial.transform import Rotation
 
-from mapctl.formats import sandbox
-from mapctl.formats.parts import (
-    GREY,
-    MAX_CORNERS,
-    MAX_JOINTS,
-    FoundCharacter,
-    MeshPart,
-    Poses,
-    UnevenScaleError,
-    chain_matrices,
-    check_poses,
-    check_size,
-    complete_bind_pose,
-    decode_picture,
-    decode_srgb,
-    encode_srgb,
-    find_name,
-    make_unique,
-    mean_at_vertices,
-    sample_picture,
-    split_polygons,
-    split_scale,
-    split_scales,
-    strongest,
-)
+from mapctl.formats import parts, sandbox
 from mapctl.formats.sandbox import Refusal
 from mapctl.formats.text import MAX_FILE_BYTES, MAX_POSES
 
@@ -69,24 +45,24 @@ _MARGIN = 0.3
 """Metres around the joints within which the body is."""
 
 
-def read_character(path: Path, **choice: str | None) -> FoundCharacter:
+def read_character(path: Path, **choice: str | None) -> parts.FoundCharacter:
     """Read a character in a sandbox: see `find_character`."""
     return sandbox.call(find_character, path, **choice)
 
 
-def find_character(path: str, *, armature: str | None, animation: str | None, wanted: str) -> FoundCharacter:
+def find_character(path: str, *, armature: str | None, animation: str | None, wanted: str) -> parts.FoundCharacter:
     """Read a skeleton, and for `motion` its animation, for `mesh` its triangles. Refusal names why not."""
     try:
         stage = open_stage(path)
         listed, prims = find_skeletons(stage)
-        number = find_name(Path(path).name, listed, armature, "armature")
+        number = parts.find_name(Path(path).name, listed, armature, "armature")
         skeleton = read_skeleton(prims[number])
         outer = world_of(skeleton.prim, _FIRST)
         path = str(skeleton.prim.GetPath())
-        found = FoundCharacter(
+        found = parts.FoundCharacter(
             armature=listed[number],
             armatures=listed,
-            names=make_unique(skeleton.names),
+            names=parts.make_unique(skeleton.names),
             nodes=[f"{path}.{joint}" for joint in skeleton.joints],
             parents=tuple(skeleton.parents),
             metres_per_unit=UsdGeom.GetStageMetersPerUnit(stage),
@@ -100,7 +76,7 @@ def find_character(path: str, *, armature: str | None, animation: str | None, wa
             per_second = stage.GetTimeCodesPerSecond() or 1.0
             found.animations = {name: span / per_second for name, span in zip(names, spans, strict=True)}
             if animation is not None or bound:
-                chosen = find_name("", names, animation, "animation")
+                chosen = parts.find_name("", names, animation, "animation")
                 found.animation = names[chosen]
                 found.poses = _sample(stage, skeleton, moving[chosen], names[chosen])
         if wanted == "mesh":
@@ -118,26 +94,26 @@ def _place_rest(skeleton: "SkeletonPrim", outer: Array, stage: Array) -> Array:
     is taken for the space in which bones are as long as in the latter.
     """
     bind, rest, parents = skeleton.bind, skeleton.rest, skeleton.parents
-    check_size(outer, *(table for table in (bind, rest) if table is not None))
+    parts.check_size(outer, *(table for table in (bind, rest) if table is not None))
     if rest is None:
         assert bind is not None
         return outer @ bind
-    worlds = chain_matrices(parents, rest, outer)
+    worlds = parts.chain_matrices(parents, rest, outer)
     if bind is None:
         return worlds
-    found = complete_bind_pose(parents, (dict(enumerate(space @ bind)) for space in (outer, stage)), worlds)
+    found = parts.complete_bind_pose(parents, (dict(enumerate(space @ bind)) for space in (outer, stage)), worlds)
     if found is not None:
         return found
     try:
-        split_scales(parents, outer @ bind)
-    except UnevenScaleError:
+        parts.split_scales(parents, outer @ bind)
+    except parts.UnevenScaleError:
         return worlds
     return outer @ bind
 
 
-def _add_root(found: FoundCharacter, path: str) -> FoundCharacter:
+def _add_root(found: parts.FoundCharacter, path: str) -> parts.FoundCharacter:
     """Put a joint above those of a skeleton of several roots."""
-    found.names = make_unique([path.rpartition("/")[2], *found.names])
+    found.names = parts.make_unique([path.rpartition("/")[2], *found.names])
     found.nodes = [path, *found.nodes]
     found.parents = (-1, *(parent + 1 for parent in found.parents))
     found.worlds = np.concatenate([found.outer[None], found.worlds])
@@ -242,7 +218,7 @@ def find_skeletons(stage: Usd.Stage) -> tuple[list[str], list[Usd.Prim]]:
     prims = [prim for prim in walk(stage) if prim.IsA(UsdSkel.Skeleton)]
     if not prims:
         raise Refusal("has no Skeleton (UsdSkel), so nothing in it marks a character's joints")
-    return make_unique([prim.GetName() for prim in prims]), prims
+    return parts.make_unique([prim.GetName() for prim in prims]), prims
 
 
 def walk(stage: Usd.Stage) -> Usd.PrimRange:
@@ -254,8 +230,8 @@ def read_skeleton(prim: Usd.Prim) -> SkeletonPrim:
     """Read a skeleton's joints and poses. Refusal where they are no tree, or its tables do not fit together."""
     skeleton, where = UsdSkel.Skeleton(prim), f"skeleton {prim.GetName()!r}"
     joints = [str(joint) for joint in read_value(skeleton.GetJointsAttr()) or ()]
-    if not 1 <= len(joints) <= MAX_JOINTS:
-        raise Refusal(f"{where} has {len(joints)} joints, allowed are 1 to {MAX_JOINTS}")
+    if not 1 <= len(joints) <= parts.MAX_JOINTS:
+        raise Refusal(f"{where} has {len(joints)} joints, allowed are 1 to {parts.MAX_JOINTS}")
     parents = _find_parents(joints, where)
     said = [str(name) for name in read_value(skeleton.GetJointNamesAttr()) or ()]
     bind = _read_matrices(skeleton.GetBindTransformsAttr(), len(joints), where)
@@ -326,7 +302,7 @@ def name_animations(stage: Usd.Stage, skeleton: SkeletonPrim) -> tuple[list[str]
     for prim in walk(stage):
         if prim.IsA(UsdSkel.Animation) and prim not in found and _animated_joints(prim) & own:
             found.append(prim)
-    return make_unique([prim.GetName() for prim in found]), found, bool(bound and found[:1] == [bound])
+    return parts.make_unique([prim.GetName() for prim in found]), found, bool(bound and found[:1] == [bound])
 
 
 def animated_placement(prim: Usd.Prim) -> list[float]:
@@ -349,7 +325,7 @@ def _attributes_of(prim: Usd.Prim) -> list[Usd.Attribute]:
     return [animation.GetTranslationsAttr(), animation.GetRotationsAttr(), animation.GetScalesAttr()]
 
 
-def _sample(stage: Usd.Stage, skeleton: SkeletonPrim, prim: Usd.Prim, name: str) -> Poses:
+def _sample(stage: Usd.Stage, skeleton: SkeletonPrim, prim: Usd.Prim, name: str) -> parts.Poses:
     animation, attributes, what = UsdSkel.Animation(prim), _attributes_of(prim), f"animation {name!r}"
     codes = {code for attribute in attributes for code in attribute.GetTimeSamples()}
     placed = animated_placement(skeleton.prim)
@@ -359,15 +335,15 @@ def _sample(stage: Usd.Stage, skeleton: SkeletonPrim, prim: Usd.Prim, name: str)
     codes |= set(placed)
     if codes and not np.isfinite(sum(codes)):
         raise Refusal(f"{what} has times that are not finite")
-    check_poses(len(codes), len(skeleton.joints))
+    parts.check_poses(len(codes), len(skeleton.joints))
     if placed:
         span = range(int(np.ceil(min(codes))), int(min(np.floor(max(codes)), min(codes) + MAX_POSES)) + 1)
-        check_poses(len(span), len(skeleton.joints))
+        parts.check_poses(len(span), len(skeleton.joints))
         codes |= {float(code) for code in span}
     times = np.array(sorted(codes) or [0.0])
     local = _sample_joints(skeleton, animation, attributes, times, what)
     outer = [world_of(skeleton.prim, Usd.TimeCode(time)) for time in (times.tolist() if placed else times[:1].tolist())]
-    return Poses(per_second, times / per_second, local, np.array(outer))
+    return parts.Poses(per_second, times / per_second, local, np.array(outer))
 
 
 def _sample_joints(
@@ -421,10 +397,10 @@ def _to_quaternions(turns: Array) -> Array:
 def _corner_colours(mesh: UsdGeom.Mesh, counts: Array, vertices: Array, folder: Path) -> Array:
     """Return sRGB and opacity (corners, 4), 0 to 1, of a mesh's corners, of which face k has `counts[k]` and corner k
     is at vertex `vertices[k]`."""
-    rgba = np.tile(np.array(GREY), (len(vertices), 1))
+    rgba = np.tile(np.array(parts.GREY), (len(vertices), 1))
     own = _corner_values(mesh, "displayColor", 3, counts, vertices)
     if own is not None:
-        rgba[:, :3] = encode_srgb(own)
+        rgba[:, :3] = parts.encode_srgb(own)
     uv = _corner_values(mesh, "st", 2, counts, vertices)
     for material, here in _find_materials(mesh, counts):
         colours = _material_colours(material, None if uv is None else uv[here], folder)
@@ -477,15 +453,15 @@ def _material_colours(material: UsdShade.Material, uv: Array | None, folder: Pat
         return None
     entry = shader.GetInput("diffuseColor")
     if not entry:
-        return np.array([*encode_srgb(np.full(3, 0.18)), 1.0])
+        return np.array([*parts.encode_srgb(np.full(3, 0.18)), 1.0])
     for attribute in UsdShade.Utils.GetValueProducingAttributes(entry):
         source = UsdShade.Shader(attribute.GetPrim())
         if source and source.GetIdAttr().Get() == "UsdUVTexture":
             picture = None if uv is None else _read_picture(source, folder)
-            return None if picture is None or uv is None else sample_picture(picture, uv * (1, -1) + (0, 1))
+            return None if picture is None or uv is None else parts.sample_picture(picture, uv * (1, -1) + (0, 1))
         value = read_value(attribute)
         if value is not None and np.shape(value) == (3,):
-            return np.array([*encode_srgb(np.array(value, np.float64)), 1.0])
+            return np.array([*parts.encode_srgb(np.array(value, np.float64)), 1.0])
     return None
 
 
@@ -499,13 +475,13 @@ def _read_picture(source: UsdShade.Shader, folder: Path) -> Array | None:
     if not asset or asset.GetSize() > _MAX_PICTURE_BYTES:
         return None
     with asset:
-        return decode_picture(bytes(asset.GetBuffer()))
+        return parts.decode_picture(bytes(asset.GetBuffer()))
 
 
-def _read_parts(stage: Usd.Stage, skeleton: SkeletonPrim, folder: Path) -> list[MeshPart]:
+def _read_parts(stage: Usd.Stage, skeleton: SkeletonPrim, folder: Path) -> list[parts.MeshPart]:
     """Read the meshes that are bound to a skeleton; pictures lie in `folder` or below."""
     cache = UsdSkel.Cache()
-    found: list[MeshPart] = []
+    found: list[parts.MeshPart] = []
     for prim in walk(stage):
         if not prim.IsA(UsdSkel.Root):
             continue
@@ -523,7 +499,7 @@ def _read_parts(stage: Usd.Stage, skeleton: SkeletonPrim, folder: Path) -> list[
     return found
 
 
-def _read_mesh(query: UsdSkel.SkinningQuery, skeleton: SkeletonPrim, folder: Path) -> MeshPart | None:
+def _read_mesh(query: UsdSkel.SkinningQuery, skeleton: SkeletonPrim, folder: Path) -> parts.MeshPart | None:
     """Read a mesh; None for what is none, is not to be seen, or has no skin."""
     prim = query.GetPrim()
     mesh = UsdGeom.Mesh(prim)
@@ -536,15 +512,15 @@ def _read_mesh(query: UsdSkel.SkinningQuery, skeleton: SkeletonPrim, folder: Pat
     points = _read_array(mesh.GetPointsAttr(), 3, np.float64)
     counts = _read_array(mesh.GetFaceVertexCountsAttr(), 1, np.int64)[:, 0]
     vertices = _read_array(mesh.GetFaceVertexIndicesAttr(), 1, np.int64)[:, 0]
-    if len(vertices) > MAX_CORNERS:
-        raise Refusal(f"{what} has {len(vertices)} corners, allowed are {MAX_CORNERS}")
+    if len(vertices) > parts.MAX_CORNERS:
+        raise Refusal(f"{what} has {len(vertices)} corners, allowed are {parts.MAX_CORNERS}")
     named = vertices.min(initial=0) >= 0 and vertices.max(initial=-1) < len(points)
     if counts.min(initial=0) < 0 or counts.sum() != len(vertices) or not named:
         raise Refusal(f"{what}: its faceVertexCounts or faceVertexIndices do not fit its {len(points)} points")
     holes = np.zeros(len(counts), bool)
     skipped = _read_array(mesh.GetHoleIndicesAttr(), 1, np.int64)[:, 0]
     holes[skipped[(skipped >= 0) & (skipped < len(counts))]] = True
-    corners, _ = split_polygons(counts, holes)
+    corners, _ = parts.split_polygons(counts, holes)
     faces = vertices[corners].reshape(-1, 3)
     if str(read_value(mesh.GetOrientationAttr()) or "") == UsdGeom.Tokens.leftHanded:
         faces = faces[:, ::-1]
@@ -552,8 +528,8 @@ def _read_mesh(query: UsdSkel.SkinningQuery, skeleton: SkeletonPrim, folder: Pat
     rows, shares = _read_carriers(query, len(points), what)
     if rows.max(initial=0) >= len(joints) or rows.min(initial=0) < 0:
         raise Refusal(f"{what} names joint {rows.max()} of {len(joints)}")
-    rgba = mean_at_vertices(_corner_colours(mesh, counts, vertices, folder), vertices, len(points))
-    return MeshPart(points, faces, rgba, joints, matrices, rows, shares)
+    rgba = parts.mean_at_vertices(_corner_colours(mesh, counts, vertices, folder), vertices, len(points))
+    return parts.MeshPart(points, faces, rgba, joints, matrices, rows, shares)
 
 
 def _read_palette(query: UsdSkel.SkinningQuery, skeleton: SkeletonPrim) -> tuple[Array, Array]:
@@ -566,7 +542,7 @@ def _read_palette(query: UsdSkel.SkinningQuery, skeleton: SkeletonPrim) -> tuple
     bind = skeleton.bind
     if bind is None:
         assert skeleton.rest is not None
-        bind = chain_matrices(skeleton.parents, skeleton.rest, np.eye(4))
+        bind = parts.chain_matrices(skeleton.parents, skeleton.rest, np.eye(4))
     return joints, np.linalg.pinv(bind[joints]) @ geometry
 
 
@@ -584,7 +560,9 @@ def _read_carriers(query: UsdSkel.SkinningQuery, count: int, what: str) -> tuple
         indices, weights = np.tile(indices[:width], count), np.tile(weights[:width], count)
     if width < 1 or len(indices) != count * width or len(weights) != count * width:
         raise Refusal(f"{what} has {count} vertices, and {len(indices)} joint indices of {width} each")
-    return strongest(np.repeat(np.arange(count), width), indices.astype(np.int64), weights.astype(np.float64), count)
+    return parts.strongest(
+        np.repeat(np.arange(count), width), indices.astype(np.int64), weights.astype(np.float64), count
+    )
 
 
 def _read_array(attribute: Usd.Attribute, width: int, dtype: type) -> Array:
@@ -641,7 +619,7 @@ def _find_locals(motion: "Motion", source: "CharacterSource") -> tuple[Array, Ar
 
     frames = source.frames
     moved, turned = frames.to_locals(motion)
-    _, unit = split_scale(frames.outer)
+    _, unit = parts.split_scale(frames.outer)
     above = np.array([unit if parent < 0 else frames.scales[parent] for parent in frames.parents])
     scales = np.repeat((frames.scales / above)[:, None], 3, axis=1)
     if "." in str(source.nodes[0]):
@@ -649,7 +627,7 @@ def _find_locals(motion: "Motion", source: "CharacterSource") -> tuple[Array, Ar
     roots = [joint for joint, parent in enumerate(frames.parents) if parent == 0]
     own = torch.from_numpy(turned[:, :1])
     moved[:, roots] = moved[:, :1] + rotations.rotate(own, torch.from_numpy(moved[:, roots])).numpy()
-    turned[:, roots] = rotations.multiply(own.expand(-1, len(roots), -1), torch.from_numpy(turned[:, roots])).numpy()
+    turned[:, roots] = rotations.multiply(own, torch.from_numpy(turned[:, roots])).numpy()
     return moved[:, 1:], turned[:, 1:], scales[1:]
 
 
@@ -891,7 +869,7 @@ def _define_mesh(stage: Usd.Stage, name: str, body: "CharacterMesh") -> Usd.Prim
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     mesh.CreateExtentAttr([Gf.Vec3f(*corner.tolist()) for corner in (body.vertices.min(0), body.vertices.max(0))])
     colour = mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
-    colour.Set(Vt.Vec3fArray.FromNumpy(decode_srgb(body.rgba[:, :3]).astype(np.float32)))
+    colour.Set(Vt.Vec3fArray.FromNumpy(parts.decode_srgb(body.rgba[:, :3]).astype(np.float32)))
     binding, width = UsdSkel.BindingAPI.Apply(mesh.GetPrim()), body.joints.shape[1]
     joints, weights = body.joints.reshape(-1).astype(np.int32), body.weights.reshape(-1).astype(np.float32)
     binding.CreateJointIndicesPrimvar(False, width).Set(Vt.IntArray.FromNumpy(joints))

@@ -14,7 +14,6 @@ from mapctl.streaming.messages import Message
 
 
 def is_number(value: object) -> bool:
-    """Return whether a value is a finite number."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 

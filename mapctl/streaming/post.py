@@ -20,7 +20,6 @@ class StreamStatistics:
     """Messages sent, of all characters."""
 
     frames_sent: int = 0
-    """Frames sent."""
     late: int = 0
     """Frames sent later after they were due than a frame may be."""
     largest_gap_ms: float = 0.0

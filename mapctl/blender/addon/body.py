@@ -50,8 +50,7 @@ class Body:
     ends: dict[str, np.ndarray]
     """Tails of last bones in the armature's space, by joint."""
     frame: np.ndarray
-    """From the armature's space to mapctl's axes and metres as it is turned and scaled, without its position, (4,
-    4)."""
+    """From the armature's space to mapctl's axes and metres as it is turned and scaled, but not moved, (4, 4)."""
     movable: frozenset[int] = frozenset()
     """Joints that may travel within their parent."""
     controls: tuple[Control, ...] = ()
@@ -195,11 +194,9 @@ class Keys:
     """F-curves with which a bone is keyed."""
 
     bone: str
-    """Name of the bone."""
     matrices: np.ndarray
     """Matrices relative to the bone's rest and its parent, (frames, 4, 4)."""
     travels: bool
-    """Whether its location is keyed."""
 
 
 def pose_bones(armature: bpy.types.Object, body: Body, moved: np.ndarray, travelling: frozenset[int]) -> list[Keys]:
@@ -264,8 +261,7 @@ def _read_moved(armature: bpy.types.Object, body: Body) -> np.ndarray:
 
 
 def measure_distance(body: Body, actual: np.ndarray, wanted: np.ndarray) -> float:
-    """Measure how far joints are from where they should be: the largest of distances by the body's size, and of sines
-    of angles."""
+    """Measure how far joints are off: the largest of distances by the body's size, and of sines of angles."""
     apart = np.linalg.norm(place_joints(body, actual) - place_joints(body, wanted), axis=-1).max()
     turned = np.abs(actual[:, :3, :3] - wanted[:, :3, :3]).max()
     return float(max(apart / np.ptp(body.heads, axis=0).max(), turned))

@@ -70,13 +70,11 @@ class WorldMotion:
     """Joints in mapctl's world: metres, Y up. A joint's rotation is relative to the rest pose."""
 
     names: tuple[str, ...]
-    """Joint names."""
     parents: tuple[int, ...]
     """Index of each joint's parent; -1 for joint 0."""
     rest: np.ndarray
     """Joints in the rest pose, (joints, 3)."""
     fps: Fraction
-    """Frames per second."""
     rotations: np.ndarray
     """Rotation matrices from the rest pose, in the world, (frames, joints, 3, 3)."""
     positions: np.ndarray

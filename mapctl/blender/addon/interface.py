@@ -62,13 +62,11 @@ class MAPCTL_AP_preferences(bpy.types.AddonPreferences):
     )
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Draw them."""
         self.layout.prop(self, "command")
         self.layout.label(text="mapctl runs as a program of its own: pip install mapctl")
 
 
 def read_command(context: bpy.types.Context) -> str:
-    """Read the command of the preferences."""
     return context.preferences.addons[__package__ or ""].preferences.command
 
 
@@ -84,7 +82,6 @@ class Report:
     step: Step | None = None
     """How far the job that runs is; None while none runs."""
     lines: tuple[str, ...] = ()
-    """Lines on the last job."""
     failed: bool = False
     """Whether they are why nothing was done."""
 
@@ -109,7 +106,6 @@ class JobOperator:
         raise NotImplementedError
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Run the job to its end."""
         wm = context.window_manager
         wm.progress_begin(0, 100)
         try:
@@ -221,7 +217,6 @@ class MAPCTL_OT_walk(JobOperator, WalkProperties, bpy.types.Operator):
     bl_label = "Walk along Curve"
 
     def prepare(self, context: bpy.types.Context, at: jobs.Scene) -> jobs.Job:
-        """Find the curve."""
         drawn = [each for each in context.selected_objects if each.type == "CURVE"]
         if len(drawn) != 1:
             raise AddonError(f"select the armature and one curve; {len(drawn)} curves are selected")
@@ -242,7 +237,6 @@ class MAPCTL_OT_clean_up(JobOperator, CleanUpProperties, bpy.types.Operator):
     bl_label = "Clean up"
 
     def prepare(self, context: bpy.types.Context, at: jobs.Scene) -> jobs.Job:
-        """Find the frames."""
         return jobs.clean_up(at, find_frames(at), anchor=self.anchor)
 
 
@@ -266,7 +260,6 @@ class MAPCTL_OT_in_between(JobOperator, bpy.types.Operator):
     bl_label = "In-between Keys"
 
     def prepare(self, context: bpy.types.Context, at: jobs.Scene) -> jobs.Job:
-        """Find the keyed frames."""
         keyed = [frame for frame, own in actions.list_keys(at.armature).items() if own]
         return jobs.fill_between_keys(at, keyed)
 
@@ -306,7 +299,6 @@ class MAPCTL_PT_sidebar(bpy.types.Panel):
     bl_category = "mapctl"
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Draw it."""
         for operator, options in (
             (MAPCTL_OT_walk, WalkProperties),
             (MAPCTL_OT_clean_up, CleanUpProperties),

@@ -80,17 +80,13 @@ class Result:
     """A motion to write as an action."""
 
     body: Body
-    """The character's joints."""
     frames: range
-    """Frames of the scene."""
     moved: np.ndarray
     """Matrices that move joints from their rest pose in the armature's space, (frames, joints, 4, 4)."""
     travelling: frozenset[int]
-    """Joints that travel within their parent."""
     generated: np.ndarray
     """Which frames have generated keys, (frames,)."""
     name: str
-    """Name of the new action."""
     fresh: bool
     """Whether the action is empty at first, not a copy of the one before."""
 

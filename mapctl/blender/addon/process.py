@@ -20,16 +20,13 @@ class Step(NamedTuple):
     """How far a job is."""
 
     label: str
-    """Label of the step."""
     done: int = 0
-    """Work done."""
     total: int = 0
     """Work in all; 0 where that is not known."""
     idle: bool = False
     """Whether the job waits for another process, so that asking again at once leads nowhere."""
 
     def describe(self) -> str:
-        """Describe it in a few words."""
         return f"{self.label} {100 * self.done // self.total} %" if self.total else self.label
 
 
@@ -113,7 +110,6 @@ class Process:
 
     @property
     def running(self) -> bool:
-        """Whether it has not ended yet."""
         return self._process.poll() is None
 
     def check(self) -> None:

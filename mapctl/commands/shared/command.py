@@ -13,8 +13,7 @@ if TYPE_CHECKING:
 
 
 def use_single_thread() -> None:
-    """Compute with one thread: on matrices this small two fight each other. Takes full effect before numpy is first
-    imported."""
+    """Compute with one thread: on matrices this small two fight. Takes full effect before numpy is first imported."""
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     import torch

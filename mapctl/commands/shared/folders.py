@@ -14,7 +14,6 @@ from joblib import Parallel, delayed
 from mapctl import formats
 from mapctl.commands.shared import outputs
 from mapctl.commands.shared.command import NOT_SATISFIED
-from mapctl.commands.shared.outputs import explain_progress, show_progress
 from mapctl.errors import DiskFullError, MapctlError, RequestError
 
 Work = Callable[[Path, Path], tuple[int, float]]
@@ -62,10 +61,10 @@ def run_folder(
     elif processes == 1:
         ended = map(run, left)
     else:
-        ended = _run_over_processes(left, run, processes)
+        ended: Any = Parallel(n_jobs=processes, return_as="generator_unordered")(delayed(run)(job) for job in left)
     results: list[_Result] = []
-    counted = explain_progress(len(left), "files", "" if again else "the same command goes on with the others")
-    with show_progress(label, quiet=quiet) as progress, counted as finished:
+    counted = outputs.explain_progress(len(left), "files", "" if again else "the same command goes on with the others")
+    with outputs.show_progress(label, quiet=quiet) as progress, counted as finished:
         for result in ended:
             results.append(result)
             finished(len(results))
@@ -119,10 +118,6 @@ def _run_job(work: Work, job: tuple[Path, Path]) -> _Result:
         return _Result(source, " ".join(str(error).split()))
     except Exception as error:
         return _Result(source, f"{type(error).__name__}: {' '.join(str(error).split())}")
-
-
-def _run_over_processes(jobs: Sequence[tuple[Path, Path]], run: Callable[..., _Result], count: int) -> Any:
-    return Parallel(n_jobs=count, return_as="generator_unordered")(delayed(run)(job) for job in jobs)
 
 
 def _run_over_cluster(

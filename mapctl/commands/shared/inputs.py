@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from scenes.drawn_character import DrawnCharacter
 
 OVERRULE = "--unit, --up and --rig overrule what was guessed"
-"""How to settle a doubt."""
 MAX_FRAMES = 3_600_000
 """Frames of the longest motion in one call: 33 hours at the priors' rate."""
 
@@ -62,8 +61,7 @@ def read_rig_clip(text: str, options: ReadOptions | None = None) -> tuple[Motion
 
 
 def read_motion(path: Path, rig: Rig | None, *, fps: Fraction | None = None, quiet: bool = False) -> Motion:
-    """Read a motion in metres, from the rig's unit where it has one; `fps` is that of an .amc. Print what is doubtful
-    unless `quiet`."""
+    """Read a motion in metres, by the rig's unit if it has one; `fps` is an .amc's. Print doubts unless `quiet`."""
     motion = formats.load(path, fps=fps, metres_per_unit=None if rig is None else rig.metres_per_unit)
     _report_reading(path, motion, rig, quiet=quiet)
     return motion

@@ -13,12 +13,13 @@ from mapctl.errors import RequestError
 
 OutFile = Annotated[Path, arg(aliases=["-o"], metavar="FILE")]
 OutFolder = Annotated[Path, arg(aliases=["-o"], metavar="DIR")]
-DataFolder = Annotated[Path, arg(metavar="DIR")]
 InFile = Positional[Annotated[Path, arg(metavar="IN")]]
 CurveText = Annotated[str, arg(metavar="CURVE")]
 Number = Annotated[float, arg(metavar="NUMBER")]
 Count = Annotated[int, arg(metavar="N")]
 Name = Annotated[str, arg(metavar="NAME")]
+Prior = Annotated[str, arg(metavar="NAME", help="A bundled prior, or the file or run folder of a trained one.")]
+Quiet = Annotated[bool, arg(help="No summary and no progress bar.")]
 MaybeSpeed = Annotated[str | None, arg(metavar="M/S|ARC:M/S,...")]
 MaybeFile = Annotated[Path | None, arg(metavar="FILE")]
 MaybeCurve = Annotated[str | None, arg(metavar="CURVE")]
@@ -33,6 +34,9 @@ CameraKind = Literal["follow", "fixed", "top"]
 Size = Annotated[str, arg(metavar="WxH")]
 
 OutRig = Annotated[str, arg(metavar="canonical|PRESET|FILE.toml|CLIP")]
+_BODY = """Body that moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by
+name or TOML file, whose joints get the canonical bones."""
+BodyRig = Annotated[str, arg(metavar="canonical|PRESET|FILE.toml|CLIP", help=_BODY)]
 MaybeAxis = Annotated[Literal["x", "y", "z", "-x", "-y", "-z"] | None, arg(metavar="x|y|z|-x|-y|-z")]
 
 
@@ -119,7 +123,6 @@ def _describe_value(value: Any) -> Any:
 
 
 def collect_paths(*paths: Path | None) -> list[Path]:
-    """Collect the paths that are given."""
     return [path for path in paths if path is not None]
 
 

@@ -12,8 +12,6 @@ from controllers.inbetweening.proposers import AutoInbetweener, ModelLoaders
 from mapctl import formats, metrics, motion_dna
 from mapctl import report as reports
 from mapctl.commands.shared import inputs, options, outputs
-from mapctl.commands.shared.options import ProposalOptions
-from mapctl.commands.shared.outputs import show_progress
 from mapctl.errors import RequestError
 from mapctl.metrics import make_comparable
 from mapctl.motion import Motion
@@ -29,7 +27,7 @@ Examples = Sequence[tuple[str, MotionDna | None]]
 """Name and poses of each motion file whose style is requested; without poses the name of a class."""
 
 
-def read_dna(command: ProposalOptions) -> Examples:
+def read_dna(command: options.ProposalOptions) -> Examples:
     """Read the motion files that --dna names; what is none is a class. RequestError for methods without styles, and for
     files that no poses can be taken of."""
     if command.dna is None:
@@ -79,7 +77,7 @@ def check_destinations(out: Path, video: Path | None, *others: Path | None, give
         outputs.check_film(video, outputs.FILM_SIZE)
 
 
-def check_proposal(command: ProposalOptions, *, prior: str | None = None, way: bool | None = None) -> None:
+def check_proposal(command: options.ProposalOptions, *, prior: str | None = None, way: bool | None = None) -> None:
     """Raise RequestError for an unknown method, and for a density or a network that the method does not use. `way`:
     whether --way asks for the hips' positions, of a command that has it."""
     method = command.method
@@ -100,7 +98,9 @@ def _is_tweener(inbetweener: str | None) -> bool:
     return inbetweener is not None and priors.find_inbetweener_kind(inbetweener) == "tweener"
 
 
-def load_models(command: ProposalOptions, *, prior: str | None = None, dna: Examples | None = None) -> ModelLoaders:
+def load_models(
+    command: options.ProposalOptions, *, prior: str | None = None, dna: Examples | None = None
+) -> ModelLoaders:
     """Build the loaders of the named models, or of the bundled ones, tweeners in a style if there is one; RequestError
     for a network that is not of the kind that the method asks for, and for classes that are not known. A named tweener
     is, for `auto`, the one that it takes in long gaps.
@@ -149,7 +149,7 @@ def write_result(
     if getattr(command, "report", None) is not None:
         reports.write_report({**build_report(name, command, solution), **more}, command.report)
     if command.video is not None:
-        with show_progress("filming", quiet=command.quiet) as progress:
+        with outputs.show_progress("filming", quiet=command.quiet) as progress:
             film_side_by_side(before, solution.motion, command.video, rig=rig, progress=progress)
 
 

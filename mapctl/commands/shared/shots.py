@@ -53,9 +53,7 @@ class ShotPlan:
     prior: LstmGmmDensity
     """Density of its walks."""
     character: Character
-    """Its body."""
     fps: Fraction
-    """Rate of its motion."""
     note: str | None = None
     """Changes to its curve."""
 
@@ -202,13 +200,11 @@ class PlayedShot:
     """A solved shot of one actor."""
 
     plan: ShotPlan
-    """The request."""
     solution: ShotSolution
     """Its solution, on canonical joints at PRIOR_FPS."""
 
     @property
     def request(self) -> ShotRequest:
-        """Request of the shot."""
         return self.plan.request
 
     @property
@@ -236,7 +232,6 @@ class PlayedShot:
         return add_licence(found)
 
     def summary(self) -> list[str]:
-        """Format a few lines for the user."""
         m = {name: "-" if value != value else f"{value:.1f}" for name, value in self.measures.items()}
         cost = report.summarise_timing(self.solution.windows, seconds=self.solution.seconds)
         motion, speed, planted = self.solution.motion, self.measures["speed_m_s"], self.measures["planted_share"]
@@ -245,22 +240,18 @@ class PlayedShot:
             + ("" if constraint.holds else ", NOT HELD")
             for constraint in self.solution.constraints
         ]
-        return [
+        lines = [
             f"motion    {motion.num_frames} frames, {motion.seconds:.1f} s, {speed:.2f} m/s",
             f"path      error {m['path_error_mean_cm']} cm mean, {m['path_error_max_cm']} max; sway {m['sway_cm']} cm",
             f"progress  {m['travelled_m']} of {m['wanted_m']} m",
             f"feet      planted {planted:.0%} of the time, then moving {m['contact_speed_cm_s']} cm/s",
             *constraints,
-            *(
-                [
-                    f"cost      {cost['frame_ms_p50']:.1f} ms a frame (p99 {cost['frame_ms_p99']:.1f}), "
-                    f"{cost['evaluations_per_frame']:.1f} evaluations a frame, threads: {cost['threads']}"
-                ]
-                if self.solution.windows
-                else []
-            ),
-            f"status    {self.solution.status.text}",
         ]
+        if self.solution.windows:
+            took = f"{cost['frame_ms_p50']:.1f} ms a frame (p99 {cost['frame_ms_p99']:.1f})"
+            often = f"{cost['evaluations_per_frame']:.1f} evaluations a frame"
+            lines.append(f"cost      {took}, {often}, threads: {cost['threads']}")
+        return [*lines, f"status    {self.solution.status.text}"]
 
 
 def play_shot(
