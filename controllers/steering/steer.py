@@ -356,7 +356,7 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
     done, outcome = _solve_step(conditioned, terms, search, free=free)
     if outcome is not Outcome.DONE:
         cold = replace(state.committed, warm_start=state.committed.warm_start[:0])
-        restarted = replace(conditioned, committed=cold)
+        restarted = replace(conditioned, committed=cold, steps=None)
         done, _ = _solve_step(restarted, terms, 0.0, free=False)  # the prior's own continuation, which always exists
     new, record = done.features[-settings.commit :], done.windows[-1]
     cut_short = record.outcome == LbfgsStatus.OUT_OF_BUDGET.value and record.evaluations < settings.evaluations
@@ -517,8 +517,8 @@ def _find_stand(state: SteerState, command: Command) -> Stand | None:
 
 def _is_at_rest(state: SteerState) -> bool:
     """Return whether the body hardly went in the last half second."""
-    went = len(state.committed.joints_world) > _RECENT_FRAMES and float(_recent_velocity(state).norm())
-    return went is not False and went < state.settings.standing
+    seen = len(state.committed.joints_world) > _RECENT_FRAMES
+    return seen and float(_recent_velocity(state).norm()) < state.settings.standing
 
 
 def _find_pose(state: SteerState) -> Motion:
