@@ -59,7 +59,8 @@ def test_a_folder_shows_the_means_of_its_clips(result, capsys):
     assert "realism" not in values
     assert run(result) == 0
     table = capsys.readouterr().out
-    assert "over 5 clips" in table and "largest" in table
+    assert "over 5 clips" in table
+    assert "largest" in table
     assert all(name in table for name in rows[0])
 
 
