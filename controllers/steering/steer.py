@@ -92,6 +92,7 @@ KEPT_FRAMES = 11
 _JUDGED_FRAMES = 60  # that are kept for terms that look back
 _PAST_TARGET_FRAMES = 60  # past targets that are kept: more than the root velocity term looks back on
 _RECENT_FRAMES = 15  # frames, half a second, over which the velocity error is measured
+_REST_FRAMES = 8  # over which a body at rest hardly goes
 _MIN_TRAVEL_SPEED = 0.3  # m/s below which the velocity has no direction
 _SIGMA_LEAVING = (
     0.1  # radians, of the hips' heading in a start, which finds its first step sooner where they turn first
@@ -516,9 +517,10 @@ def _find_stand(state: SteerState, command: Command) -> Stand | None:
 
 
 def _is_at_rest(state: SteerState) -> bool:
-    """Return whether the body hardly went in the last half second."""
-    seen = len(state.committed.joints_world) > _RECENT_FRAMES
-    return seen and float(_recent_velocity(state).norm()) < state.settings.standing
+    """Return whether the body hardly went in the last quarter of a second."""
+    past = state.committed.joints_world[-_REST_FRAMES - 1 :, 0, ::2]
+    went = float((past[-1] - past[0]).norm()) * PRIOR_FPS / _REST_FRAMES
+    return len(past) > _REST_FRAMES and went < state.settings.standing
 
 
 def _find_pose(state: SteerState) -> Motion:

@@ -104,7 +104,12 @@ def plan_steps(pose: Motion, stand: Motion, command: Command, targets: Sequence[
     stop = move_to(rotate_about_vertical(stand, float(turns[-1])), track[-1, :2])
     move = Displacement.between(pose, stop, track)
     frames = len(targets) if command.speed > 0 else _STEP_FRAMES * move.count_steps() + 3
-    steps = plan_footsteps(move, frames, least=2 if move.moves_feet else 0)
+    least = 2 if move.moves_feet else 0
+    steps = plan_footsteps(move, frames, least=least)
+    if command.speed > 0 and not move.leads_aside and len(steps) > 1:
+        # The first and the last step are half ones: hips would go faster between them.
+        frames = round(frames * len(steps) / (len(steps) - 1))
+        steps = plan_footsteps(move, frames, least=least)
     return PlannedSteps(command, encode(take_steps(move, steps, frames))[0][1:].float()) if steps else None
 
 
