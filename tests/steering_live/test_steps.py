@@ -132,7 +132,7 @@ def test_a_stand_sways_without_creeping_trembling_or_repeating(stand):
 def test_bundled_densities_obey_commands_that_are_no_walk(name):
     commands = [
         *(Command(1.1, 0.0), Command(0.0, 0.0), Command(0.7, math.pi, 0.0), Command(0.5, math.pi / 2, 0.0)),
-        *(Command(0.0, 0.0), Command(0.0, math.pi / 2), Command(0.7, 0.8, math.pi / 2), Command(0.0, -2.0)),
+        *(Command(0.0, 0.0), Command(0.0, math.pi / 2), Command(0.0, -0.6), Command(0.7, 0.3, -0.6)),
     ]
     times = [4.0 * number for number in range(len(commands))]
     track = CommandTrack((*times, times[-1] + 4.0), (*commands, commands[-1]))
