@@ -114,8 +114,7 @@ class SteerSettings:
     commit: int = 3
     """Frames that a step commits and delivers."""
     evaluations: int = 8
-    """Most evaluations of energy and gradient in a step. With 14, commands are reached no sooner, and planted toes move
-    more (`tests/benchmarks/steer.py`)."""
+    """Most evaluations of energy and gradient in a step."""
     least_evaluations: int = 6
     """Evaluations for which the loop gives a step time, however late it is: with fewer, targets are missed
     (docs/reference/results.md). Never more than `evaluations`."""
@@ -335,7 +334,7 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
     began, settings, character = time.perf_counter(), state.settings, state.character
     seconds = None if seconds is None else read_number(seconds, "the seconds of a step")
     asked, command = command, character.command(_lead_around(state, command))
-    steps, stand = _find_steps(state, command), None
+    steps = _find_steps(state, command)
     if steps is None and (stand := _find_stand(state, command)) is not None:
         return _stand_still(replace(state, stand=stand), asked, began)
     if steps is not None and steps is not state.steps:

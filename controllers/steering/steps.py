@@ -134,8 +134,8 @@ class Stand:
         clock = torch.arange(self.frames, self.frames + frames + 1, dtype=torch.float64) / PRIOR_FPS
         settled = smootherstep((clock / _SETTLES).clamp(max=1))[:, None]
         count, joints = len(clock), self.pose.local_quat_xyzw.shape[1]
-        sides = torch.stack([torch.zeros_like(clock), 0.5 * torch.ones_like(clock)], dim=-1)
-        phases = 2 * math.pi * (clock[:, None] + sides * 10)
+        # Five seconds apart, so that the hips go round rather than to and fro on a line.
+        phases = 2 * math.pi * (clock[:, None] + torch.tensor([0.0, 5.0], dtype=torch.float64))
         sway = sum((0.001 * size * torch.sin(hz * phases) for hz, size in _SWAY), torch.zeros(count, 2).double())
         sway = sway * smootherstep((clock / _SWAYS).clamp(max=1))[:, None]
         root = torch.lerp(self.pose.root_position, self.stand.root_position, settled) + rotations.lift_ground(sway)
