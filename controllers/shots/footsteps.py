@@ -29,8 +29,8 @@ from mapctl.terms import Keyframe
 SIDES = ("left", "right")
 """Names of the feet, in the order of their numbers."""
 _LEGS = [LIMBS[name] for name in FEET]
-_SWING, _BOTH = 13, 4  # frames at PRIOR_FPS of a swing, and of double support before and after it
-_STEP, _TURN = 0.7, math.radians(75.0)  # of legs' length, and radians, that a foot is put ahead of the other at most
+SWING, BOTH = 13, 4  # frames at PRIOR_FPS of a swing, and of double support before and after it
+STEP, _TURN = 0.7, math.radians(75.0)  # of legs' length, and radians, that a foot is put ahead of the other at most
 _SLOWEST = 45  # frames of a step at most: where there is more time, there are more steps
 _TRACK_STEP = 0.05  # metres between the points of a track
 CORNER = 0.04
@@ -149,12 +149,12 @@ class Displacement:
 
     def count_steps(self) -> int:
         """Count the steps that it takes at least: the first and the last are half of one between."""
-        length = _STEP * leg_length(self.start.skeleton)
+        length = STEP * leg_length(self.start.skeleton)
         return 1 + max(1, math.ceil(self.distance / length - 1e-6), math.ceil(self.turn / _TURN - 1e-6))
 
     def count_frames(self) -> int:
         """Count the frames at PRIOR_FPS that an unhurried pace takes."""
-        return 1 + self.count_steps() * (_SWING + _BOTH) + _BOTH
+        return 1 + self.count_steps() * (SWING + BOTH) + BOTH
 
     def hips_at(self, share: Float[Tensor, " n"]) -> Float[Tensor, "n 3"]:
         """Interpolate the track at shares."""
@@ -194,7 +194,7 @@ def plan_footsteps(displacement: Displacement, frames: int, *, least: int = 0) -
     plans = [_lay_steps([(first + number) % 2 for number in range(count)], frames) for first in range(2)]
     if displacement.leads_aside:
         plans += [_lay_side_steps(displacement, first, frames) for first in range(2)]
-    plan = min(plans, key=lambda plan: _measure_strain(displacement, plan))
+    plan = min(plans, key=lambda plan: measure_strain(displacement, plan))
     shares = torch.tensor([step.share for step in plan], dtype=torch.float64)
     toes = [displacement.toes_at(foot, shares)[0][:, ::2].tolist() for foot in range(2)]
     return [replace(step, toe=tuple(toes[step.foot][number])) for number, step in enumerate(plan)]
@@ -217,8 +217,8 @@ def _share_of(number: int, count: int) -> float:
 
 def _lay_steps(feet: Sequence[int], frames: int) -> list[Footstep]:
     count = len(feet)
-    swing = (frames - 1) / (count + (count + 1) * _BOTH / _SWING)
-    both, plan = swing * _BOTH / _SWING, list[Footstep]()
+    swing = (frames - 1) / (count + (count + 1) * BOTH / SWING)
+    both, plan = swing * BOTH / SWING, list[Footstep]()
     for number, foot in enumerate(feet):
         lift = both + number * (swing + both)
         plan.append(Footstep(foot, round(lift), round(lift + swing), _share_of(number, count)))
@@ -240,7 +240,7 @@ def _lay_side_steps(displacement: Displacement, first: int, frames: int) -> list
     return plan
 
 
-def _measure_strain(displacement: Displacement, plan: Sequence[Footstep]) -> float:
+def measure_strain(displacement: Displacement, plan: Sequence[Footstep]) -> float:
     """Measure the largest distance between feet that stand, metres, and by how much they cross."""
     held = torch.zeros(len(plan), 2, dtype=torch.float64)
     for number, step in enumerate(plan):
@@ -271,34 +271,43 @@ def take_steps(displacement: Displacement, plan: Sequence[Footstep], frames: int
     clock = torch.arange(frames, dtype=torch.float64)
     toes, turns, share, sways = [], [], torch.zeros_like(clock), torch.zeros_like(clock)
     for foot in range(2):
-        steps, held, swings = [step for step in plan if step.foot == foot], 0.0, list[_Swing]()
+        steps, held, swings = [step for step in plan if step.foot == foot], 0.0, list[Swing]()
         stands = displacement.toes_at(foot, torch.tensor([0.0, *(step.share for step in steps)], dtype=torch.float64))
         for step, position, turn in zip(steps, stands[0][1:], stands[1][1:], strict=True):
             if step is not steps[-1]:
                 position = position.new_tensor([step.toe[0], float(position[1]), step.toe[1]])
-            swings.append(_Swing(step, position, turn))
+            swings.append(Swing(step, position, turn))
             share = share + 0.5 * (step.share - held) * smootherstep(step.swing_at(clock))
-            lifted = torch.sin(math.pi * step.swing_at(clock).clamp(0, 1)).square()
-            sways, held = sways + (-_SWAY if foot == 0 else _SWAY) * lifted, step.share
-        position, turn = _swing_foot(clock, stands[0][0], stands[1][0], swings)
+            sways, held = sways + sway_from(step, clock), step.share
+        position, turn = swing_foot(clock, stands[0][0], stands[1][0], swings)
         toes.append(position)
         turns.append(turn)
-    hips = displacement.hips_at(_smooth_between(share))
-    aside = rotations.rotate_ground(torch.stack([_smooth_between(sways), 0 * sways], dim=-1), hips[:, 2])
-    weight = smootherstep(clock / (frames - 1))
-    root = torch.lerp(start.root_position, stop.root_position, weight[:, None])
-    root = torch.stack([hips[:, 0] + aside[:, 0], root[:, 1], hips[:, 1] + aside[:, 1]], dim=-1)
-    first, last = (_without_heading(pose) for pose in (start, stop))
-    quats = rotations.slerp(
-        first.expand(frames, -1, 4), last.expand(frames, -1, 4), weight[:, None].expand(frames, first.shape[1])
-    )
+    hips, weight = displacement.hips_at(_smooth_between(share)), smootherstep(clock / (frames - 1))
+    body = pose_hips(start, stop, hips, _smooth_between(sways), weight)
+    return stand_on(body, torch.stack(toes, dim=1), torch.stack(turns, dim=1))
+
+
+def sway_from(step: Footstep, clock: Float[Tensor, " frames"]) -> Float[Tensor, " frames"]:
+    """Return how far hips go aside to the foot that stands during a step, metres; to the left where positive."""
+    return (-_SWAY if step.foot == 0 else _SWAY) * torch.sin(math.pi * step.swing_at(clock).clamp(0, 1)).square()
+
+
+def pose_hips(
+    start: Motion, stop: Motion, hips: Float[Tensor, "frames 3"], sways: Tensor, weight: Float[Tensor, " frames"]
+) -> Motion:
+    """Pose a body with its hips at ground positions and headings, and aside of them by `sways`, metres; height and
+    joints go from one pose to another by weights."""
+    aside = rotations.rotate_ground(torch.stack([sways, 0 * sways], dim=-1), hips[:, 2])
+    height = torch.lerp(start.root_position[:, 1], stop.root_position[:, 1], weight)
+    root = torch.stack([hips[:, 0] + aside[:, 0], height, hips[:, 1] + aside[:, 1]], dim=-1)
+    first, last = (_without_heading(pose).expand(len(hips), -1, 4) for pose in (start, stop))
+    quats = rotations.slerp(first, last, weight[:, None].expand(first.shape[:2]))
     quats = torch.cat([rotations.multiply(rotations.about_y(hips[:, 2]), quats[:, 0])[:, None], quats[:, 1:]], dim=1)
-    motion = replace(start, root_position=root, local_quat_xyzw=quats)
-    return _stand_on(motion, torch.stack(toes, dim=1), torch.stack(turns, dim=1))
+    return replace(start, root_position=root, local_quat_xyzw=quats)
 
 
 @dataclass(frozen=True, eq=False)
-class _Swing:
+class Swing:
     """A step as a foot takes it."""
 
     step: Footstep
@@ -310,8 +319,8 @@ class _Swing:
     """Velocity of a toe that is in the air already, m/s; None of a foot that stands, and whose heel rises first."""
 
 
-def _swing_foot(
-    clock: Float[Tensor, " frames"], toe: Float[Tensor, "3"], turn: Float[Tensor, "4"], swings: Sequence[_Swing]
+def swing_foot(
+    clock: Float[Tensor, " frames"], toe: Float[Tensor, "3"], turn: Float[Tensor, "4"], swings: Sequence[Swing]
 ) -> tuple[Float[Tensor, "frames 3"], Float[Tensor, "frames 4"]]:
     """Swing a foot from where it stands along its steps; return position of the toe joint and rotation of the foot.
 
@@ -366,7 +375,7 @@ def _smooth_between(values: Float[Tensor, " frames"]) -> Float[Tensor, " frames"
     return smooth + (1 - weight) * (values[0] - smooth[0]) + weight * (values[-1] - smooth[-1])
 
 
-def _stand_on(motion: Motion, toes: Float[Tensor, "frames 2 3"], turns: Float[Tensor, "frames 2 4"]) -> Motion:
+def stand_on(motion: Motion, toes: Float[Tensor, "frames 2 3"], turns: Float[Tensor, "frames 2 4"]) -> Motion:
     """Bring the feet of a motion to positions of the toe joints and rotations in the world; hips go lower where a leg
     does not reach, but for the first and the last frame."""
     ankles = find_ankles(motion.skeleton, toes, turns)
@@ -423,7 +432,7 @@ def bend_legs(motion: Motion, ankles: Float[Tensor, "frames 2 3"], turns: Float[
 
 
 _FASTEST_LANDING = 7  # frames that a swing under way still takes at least
-_AIRBORNE = 0.5  # m/s of a toe, from which on it is in its swing
+AIRBORNE = 0.5  # m/s of a toe, from which on it is in its swing
 _AHEAD = 1.9  # times that a swing under way takes longer than at its speed, so that it ends at rest
 
 
@@ -442,13 +451,13 @@ class LastSteps:
         """Plan both steps: the foot that swings, or the one behind, lands; then the other one follows."""
         toes, speeds = self._toes, self._velocities.norm(dim=-1)
         away = (toes[self.stop] - toes[self.start]).norm(dim=-1)
-        first = int(speeds.argmax()) if float(speeds.max()) > _AIRBORNE else int(away.argmax())
-        swing = _SWING
-        if float(speeds[first]) > _AIRBORNE:
+        first = int(speeds.argmax()) if float(speeds.max()) > AIRBORNE else int(away.argmax())
+        swing = SWING
+        if float(speeds[first]) > AIRBORNE:
             swing = round(_AHEAD * float(away[first] / speeds[first]) * PRIOR_FPS)
-            swing = max(_FASTEST_LANDING, min(_SWING, swing))
+            swing = max(_FASTEST_LANDING, min(SWING, swing))
         landed = min(self.start + swing, self.stop - 2)
-        last = min(self.stop, landed + 1 + _SWING)
+        last = min(self.stop, landed + 1 + SWING)
         steps = [Footstep(first, self.start, landed), Footstep(1 - first, landed + 1, last)]
         ground = toes[self.stop][:, ::2].tolist()
         return [replace(step, toe=tuple(ground[step.foot])) for step in steps if float(away[step.foot]) > _MOVED]
@@ -460,7 +469,7 @@ class LastSteps:
         if not plan:
             return 0.0
         first, (begin, end) = plan[0].foot, (toes[self.start], toes[self.stop])
-        most = _STEP * leg_length(self.motion.skeleton)
+        most = STEP * leg_length(self.motion.skeleton)
         travel = self.motion.root_position[self.stop, ::2] - self.motion.root_position[self.start, ::2]
         ahead = torch.nn.functional.normalize(travel, dim=0)
         back = float(((begin - end) @ ahead).clamp_min(0).sum())
@@ -481,10 +490,10 @@ class LastSteps:
                 turn = rotations.slerp(first.expand(len(clock), 4), last.expand(len(clock), 4), share)
             else:
                 velocity = self._velocities[foot] if step.lift == self.start else None
-                toe, turn = _swing_foot(clock, begin, first, [_Swing(step, end, last, velocity)])
+                toe, turn = swing_foot(clock, begin, first, [Swing(step, end, last, velocity)])
             toes.append(toe)
             turns.append(turn)
-        return _stand_on(self.motion.slice(self.start, self.stop + 1), torch.stack(toes, 1), torch.stack(turns, 1))
+        return stand_on(self.motion.slice(self.start, self.stop + 1), torch.stack(toes, 1), torch.stack(turns, 1))
 
     @property
     def _toes(self) -> Float[Tensor, "frames 2 3"]:

@@ -21,15 +21,8 @@ from torch import Tensor
 from controllers.common.character import Character
 from controllers.common.initial_state import start_from_state
 from controllers.steering.overlay import Overlay
-from controllers.steering.steps import (
-    PLANNED_FRAMES,
-    PlannedSteps,
-    Stand,
-    find_pose,
-    find_stand,
-    needs_steps,
-    plan_steps,
-)
+from controllers.steering.stand import Stand, find_pose, find_stand
+from controllers.steering.steps import PlannedSteps, needs_steps, plan_travel, plan_turn
 from mapctl import rotations
 from mapctl.arguments import read_number, read_point
 from mapctl.curves.obstacles import Obstacle, measure_clearance
@@ -93,6 +86,7 @@ _JUDGED_FRAMES = 60  # that are kept for terms that look back
 _PAST_TARGET_FRAMES = 60  # past targets that are kept: more than the root velocity term looks back on
 _RECENT_FRAMES = 15  # frames, half a second, over which the velocity error is measured
 _REST_FRAMES = 8  # over which a body at rest hardly goes
+_FASTEST_PLANNED = 1.5  # m/s beyond which a body slows down before its steps are planned
 _MIN_TRAVEL_SPEED = 0.3  # m/s below which the velocity has no direction
 _SIGMA_LEAVING = (
     0.1  # radians, of the hips' heading in a start, which finds its first step sooner where they turn first
@@ -337,15 +331,13 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
     steps = _find_steps(state, command)
     if steps is None and (stand := _find_stand(state, command)) is not None:
         return _stand_still(replace(state, stand=stand), asked, began)
-    if steps is not None and steps is not state.steps:
-        state = replace(state, target=_start_target(state, command))
-    elif steps is None and needs_steps(command, float(state.committed.ground_pose.heading)):
+    if steps is None and needs_steps(command, float(state.committed.ground_pose.heading)):
         command = replace(command, speed=0.0, heading=command.hips_heading)  # it comes to rest first
     state = replace(state, steps=steps, stand=None)
     stuck = steps is None and _velocity_error(state) > settings.stuck
     if stuck:
         state = _restart_target(state)
-    targets, leaving = _plan_targets(state, command)
+    targets, leaving = (steps.targets_of(settings.horizon), False) if steps else _plan_targets(state, command)
     conditioned = replace(state, prior=condition_prior(state.prior, command.labels))
     free = steps is None and (stuck or leaving)
     sigma_facing = min(settings.sigma_facing, _SIGMA_LEAVING) if free else settings.sigma_facing
@@ -485,27 +477,19 @@ def _limit_evaluations(state: SteerState, evaluations: int, seconds: float | Non
 
 
 def _find_steps(state: SteerState, command: Command) -> PlannedSteps | None:
-    """Find the planned steps from which the search starts: those under way, or new ones of a body that is at rest and
-    whose command leads to no walk, or to a stand."""
-    if state.steps is not None and state.steps.obey(command):
-        return state.steps
-    heading = float(state.committed.ground_pose.heading)
-    taken = state.steps is not None and not len(state.steps.features)  # its last pose is a stand
-    if not (taken or _is_at_rest(state)) or not (command.speed == 0 or needs_steps(command, heading)):
+    """Find the planned steps from which the search starts: those under way, or new ones, of a body whose command leads
+    to no walk or that is at rest and is to stand."""
+    steps, limits = state.steps, state.settings.limits
+    if steps is not None and steps.obey(command):
+        return steps
+    needed = needs_steps(command, float(state.committed.ground_pose.heading))
+    if command.speed > 0 and needed and float(_recent_velocity(state, _REST_FRAMES).norm()) < _FASTEST_PLANNED:
+        stand = _find_mean_stand(state, command)
+        return plan_travel(_find_pose(state), state.committed.joints_world, stand, command, limits)
+    ended = steps is not None and steps.ended
+    if command.speed > 0 or not (ended or _is_at_rest(state)) or not (needed or (state.stand is None and not ended)):
         return None
-    came_to_stand = state.stand is not None or (state.steps is not None and state.steps.command.speed == 0)
-    if came_to_stand and not needs_steps(command, heading):
-        return None
-    targets = [SteeringTarget(0.0, command.hips_heading, command.hips_heading)]
-    if command.speed > 0:
-        start = _start_target(state, command)
-        targets = start.ahead(command, state.settings.limits, frames=PLANNED_FRAMES, fps=PRIOR_FPS)
-    return plan_steps(_find_pose(state), _find_mean_stand(state, command), command, targets)
-
-
-def _start_target(state: SteerState, command: Command) -> SteeringTarget:
-    """Return the steering target from which a body at rest sets out: it can go any direction at once."""
-    return SteeringTarget(0.0, command.heading, float(state.committed.ground_pose.heading))
+    return plan_turn(_find_pose(state), _find_mean_stand(state, command), command.hips_heading, limits)
 
 
 def _find_stand(state: SteerState, command: Command) -> Stand | None:
@@ -517,9 +501,8 @@ def _find_stand(state: SteerState, command: Command) -> Stand | None:
 
 def _is_at_rest(state: SteerState) -> bool:
     """Return whether the body hardly went in the last quarter of a second."""
-    past = state.committed.joints_world[-_REST_FRAMES - 1 :, 0, ::2]
-    went = float((past[-1] - past[0]).norm()) * PRIOR_FPS / _REST_FRAMES
-    return len(past) > _REST_FRAMES and went < state.settings.standing
+    known = len(state.committed.joints_world) > _REST_FRAMES
+    return known and float(_recent_velocity(state, _REST_FRAMES).norm()) < state.settings.standing
 
 
 def _find_pose(state: SteerState) -> Motion:
@@ -584,10 +567,10 @@ def _plan_targets(state: SteerState, command: Command) -> tuple[list[SteeringTar
     return targets, leaving
 
 
-def _recent_velocity(state: SteerState) -> Float[Tensor, "2"]:
-    """Compute the mean velocity of the hips over the ground in the last half second, m/s."""
-    past = state.committed.joints_world[-_RECENT_FRAMES - 1 :, 0, ::2]
-    return (past[-1] - past[0]) * PRIOR_FPS / _RECENT_FRAMES
+def _recent_velocity(state: SteerState, frames: int = _RECENT_FRAMES) -> Float[Tensor, "2"]:
+    """Compute the mean velocity of the hips over the ground in the last frames, as many as there are, m/s."""
+    past = state.committed.joints_world[-frames - 1 :, 0, ::2]
+    return (past[-1] - past[0]) * PRIOR_FPS / max(1, len(past) - 1)
 
 
 def _restart_target(state: SteerState) -> SteerState:

@@ -1,6 +1,7 @@
 """Planned steps and stands: where they lead, what feet do meanwhile, and that steering obeys commands by them."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,9 +11,11 @@ from tiny_prior import save_tiny_prior
 import priors
 from controllers.steering import steer
 from controllers.steering.loop import Recorder, drive
-from controllers.steering.steps import PlannedSteps, Stand, find_stand, needs_steps, plan_steps
+from controllers.steering.stand import Stand, find_stand
+from controllers.steering.steps import PlannedSteps, needs_steps, plan_travel, plan_turn
+from mapctl import rotations
 from mapctl.features import PRIOR_FPS, GroundPose
-from mapctl.intent.steering import Command, CommandTrack, SteeringLimits, SteeringTarget
+from mapctl.intent.steering import Command, CommandTrack, SteeringLimits
 from mapctl.metrics.body import measure_worst
 from mapctl.metrics.travel import measure_commands
 from mapctl.pose import BodyPose, decode
@@ -39,34 +42,84 @@ def test_a_stand_has_both_feet_flat_beside_each_other_under_the_hips(stand):
     assert torch.allclose(turned[:, [0, 2]], torch.zeros(2, 2, dtype=turned.dtype), atol=1e-9)
 
 
+def play(features):
+    return decode(features.double(), GroundPose(HERE.position_xz.double(), HERE.heading.double()))
+
+
+def find_worst_feet(motion):
+    positions = motion.joint_positions()
+    assert float(positions[:, CANONICAL.indices(TOES), 1].min()) > TOE_REST_HEIGHT - 0.005
+    return measure_worst(positions, 0, CANONICAL.indices(TOES), CANONICAL.indices(FEET), PRIOR_FPS)
+
+
+@pytest.mark.parametrize("moving", [0.0, 0.8])
 @pytest.mark.parametrize(
     ("speed", "travel", "turn"),
-    [
-        (0.7, math.pi, 0.0),
-        (0.5, math.pi / 2, 0.0),
-        (0.5, -math.pi / 2, 0.0),
-        (0.6, 2.2, 0.5),
-        (0.0, 0.0, 2.5),
-        (0.0, 0.0, -0.6),
-    ],
+    [(0.7, math.pi, 0.0), (0.5, math.pi / 2, 0.0), (0.8, -math.pi / 2, 0.0), (0.6, 2.2, 0.5), (1.1, 0.8, 0.0)],
 )
-def test_steps_lead_where_the_targets_do_on_feet_that_stand(stand, speed, travel, turn):
-    """Angles are from the facing at the start, radians."""
+def test_a_body_travels_as_commanded_on_feet_that_stand(stand, speed, travel, turn, moving):
+    """From a stand, and from walking ahead; angles are from the facing at the start, radians."""
     command = Command(speed, AHEAD + travel, AHEAD + turn)
-    start = SteeringTarget(0.0, command.heading, AHEAD)
-    targets = start.ahead(command, SteeringLimits(), frames=90, fps=PRIOR_FPS)
-    steps = plan_steps(stand, stand, command, targets if speed else targets[-1:])
-    assert steps is not None
-    motion = decode(steps.features.double(), GroundPose(HERE.position_xz.double(), HERE.heading.double()))
-    went = torch.tensor([target.velocity for target in targets]).sum(dim=0) / PRIOR_FPS
-    assert float((motion.root_position[-1, ::2] - HERE.position_xz - went).norm()) < 0.01
-    assert float(BodyPose.of_motion(motion).heading[-1]) == pytest.approx(targets[-1].facing, abs=0.01)
-    positions, feet = motion.joint_positions(), (CANONICAL.indices(TOES), CANONICAL.indices(FEET))
-    worst = measure_worst(positions, 0, *feet, PRIOR_FPS)
+    step = torch.tensor([math.sin(AHEAD), 0.0, math.cos(AHEAD)]) * moving / PRIOR_FPS
+    feet = CANONICAL.indices((*TOES, *FEET))
+    joints = stand.joint_positions() + torch.arange(-5, 1)[:, None, None] * step
+    joints[:, feet] = stand.joint_positions()[:, feet]
+    steps = plan_travel(stand, joints, stand, command, SteeringLimits())
+    motion = play(steps.window(240))
+    went = (motion.root_position[-1] - motion.root_position[-1 - steps.cycle])[::2] * PRIOR_FPS / steps.cycle
+    wanted = speed * torch.tensor([math.sin(command.heading), math.cos(command.heading)], dtype=went.dtype)
+    assert float((went - wanted).norm()) < 0.01
+    assert float(BodyPose.of_motion(motion).heading[-1]) == pytest.approx(command.hips_heading, abs=0.01)
+    travelled = torch.tensor([target.velocity for target in steps.targets_of(240)]).sum(dim=0) / PRIOR_FPS
+    assert float((motion.root_position[-1, ::2] - HERE.position_xz - travelled).norm()) < 0.04
+    whole, parts = steps.window(240), [steps.after(at).window(3) for at in range(0, 240, 3)]
+    assert torch.equal(torch.cat(parts), whole)
+    worst = find_worst_feet(motion)
     assert worst["glide_cm"] < 1
-    assert worst["slide_max_cm"] < 4
+    assert worst["slide_max_cm"] < 1.5
     assert worst["unsupported_max_s"] == 0
-    assert float(positions[:, CANONICAL.indices(TOES), 1].min()) > TOE_REST_HEIGHT - 0.005
+    toes = motion.joint_positions()[:, CANONICAL.indices(TOES)]
+    apart = rotations.rotate_about_y(toes[:, 0] - toes[:, 1], -BodyPose.of_motion(motion).heading)
+    assert float(apart.norm(dim=-1).max()) < 0.85
+    assert float(apart[:, 0].min()) > -0.02  # feet do not cross
+
+
+def test_arms_swing_against_legs_and_a_foot_in_the_air_goes_on(stand):
+    hanging = stand.local_quat_xyzw.clone()
+    for name, angle in (("leftUpperArm", -1.4), ("rightUpperArm", 1.4)):
+        hanging[:, CANONICAL.index(name)] = rotations.from_rotation_vector(torch.tensor([0.0, 0.0, angle]).double())
+    stand = replace(stand, local_quat_xyzw=hanging)
+    joints = stand.joint_positions().expand(4, -1, 3).clone()
+    right = CANONICAL.index("rightToes")
+    joints[-2, right] -= torch.tensor([math.sin(AHEAD), 0.0, math.cos(AHEAD)]) * 1.5 / PRIOR_FPS
+    steps = plan_travel(stand, joints, stand, Command(0.8, AHEAD + math.pi, AHEAD), SteeringLimits())
+    motion = play(steps.window(240))
+    heading = BodyPose.of_motion(motion).heading
+    ahead = rotations.rotate_about_y(motion.joint_positions() - motion.root_position[:, None], -heading[:, None])[
+        ..., 2
+    ]
+    feet, hands = (
+        ahead[60:, CANONICAL.index(f"left{end}")] - ahead[60:, CANONICAL.index(f"right{end}")]
+        for end in ("Foot", "Hand")
+    )
+    assert float(torch.corrcoef(torch.stack([feet, hands]))[0, 1]) < -0.9
+    assert 0.1 < float(hands.abs().max()) < 0.6
+    assert float(ahead[1, right] - ahead[0, right]) > 0.004
+
+
+@pytest.mark.parametrize("turn", [2.5, -0.6])
+def test_a_turn_on_the_spot_ends_in_a_stand_that_faces_there(stand, turn):
+    steps = plan_turn(stand, stand, AHEAD + turn, SteeringLimits())
+    assert steps is not None
+    motion = play(steps.features)
+    assert float((motion.root_position[-1, ::2] - HERE.position_xz).norm()) < 0.01
+    assert float(BodyPose.of_motion(motion).heading[-1]) == pytest.approx(AHEAD + turn, abs=0.01)
+    worst = find_worst_feet(motion)
+    assert worst["glide_cm"] < 1
+    assert worst["slide_max_cm"] < 1.5
+    assert worst["unsupported_max_s"] == 0
+    assert steps.after(len(steps.features)).ended
+    assert not steps.after(1).ended
 
 
 @pytest.mark.parametrize(
@@ -91,7 +144,7 @@ def test_what_is_no_walk_needs_steps(command, wanted):
     ("command", "obeyed"),
     [
         (Command(0.6, 1.5, 0.0), True),
-        (Command(0.7, 1.6, -0.1), True),
+        (Command(0.65, 1.6, -0.1), True),
         (Command(0.0, 1.5, 0.0), False),
         (Command(0.6, -1.5, 0.0), False),
         (Command(0.6, 1.5), False),
@@ -99,8 +152,10 @@ def test_what_is_no_walk_needs_steps(command, wanted):
     ],
 )
 def test_steps_obey_commands_like_their_own(command, obeyed):
-    assert PlannedSteps(Command(0.6, 1.5, 0.0), torch.zeros(3, 68)).obey(command) == obeyed
-    assert not PlannedSteps(Command(0.6, 1.5, 0.0), torch.zeros(0, 68)).obey(command)
+    planned = PlannedSteps(Command(0.6, 1.5, 0.0), torch.zeros(3, 68), [])
+    assert planned.obey(command) == obeyed
+    assert not planned.after(3).obey(command)
+    assert replace(planned, cycle=2).after(3).obey(command) == obeyed
 
 
 def test_a_stand_sways_without_creeping_trembling_or_repeating(stand):
