@@ -46,6 +46,9 @@ class ShotOptions:
     """Gait of the motion, one of the prior's."""
     style: Annotated[str | None, arg(metavar="NAME")] = None
     """Style of the motion, one of the prior's."""
+    liveliness: Annotated[float, Field(ge=0, le=1), arg(metavar="0..1")] = 0.5
+    """Variety of the walk: 0 is the most probable one, smoother than people walk; 1 is as varied as the prior, farther
+    from the curve."""
     start: Annotated[str, Field(min_length=1), arg(metavar="walk|stand|CLIP:FRAME")] = "walk"
     """How it begins: in its stride, standing, or continuing from a frame of a motion file, on that file's rig and at
     its rate; of an actor in the clip's position unless `offset` or `turn_deg` are given."""

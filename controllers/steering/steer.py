@@ -22,7 +22,7 @@ from controllers.common.character import Character
 from controllers.common.initial_state import start_from_state
 from controllers.steering.overlay import Overlay
 from controllers.steering.stand import Stand, find_pose, find_stand
-from controllers.steering.steps import PlannedSteps, needs_steps, plan_travel, plan_turn
+from controllers.steering.steps import PlannedSteps, needs_steps, plan_steps
 from mapctl import rotations
 from mapctl.arguments import read_number, read_point
 from mapctl.curves.obstacles import Obstacle, measure_clearance
@@ -86,6 +86,7 @@ _JUDGED_FRAMES = 60  # that are kept for terms that look back
 _PAST_TARGET_FRAMES = 60  # past targets that are kept: more than the root velocity term looks back on
 _RECENT_FRAMES = 15  # frames, half a second, over which the velocity error is measured
 _REST_FRAMES = 8  # over which a body at rest hardly goes
+_PLANNED_NOISE = 2.0  # times that its prior is wider along planned steps, which it takes for less likely than they are
 _FASTEST_PLANNED = 1.5  # m/s beyond which a body slows down before its steps are planned
 _MIN_TRAVEL_SPEED = 0.3  # m/s below which the velocity has no direction
 _SIGMA_LEAVING = (
@@ -131,8 +132,11 @@ class SteerSettings:
     """Random warm starts of that solve, evaluated in one batch beside the evaluations; it begins at the best."""
     footing: FootContact = field(default_factory=FootContact)
     """Contact term."""
-    noise: LatentPrior = field(default_factory=lambda: LatentPrior(sigma=2.0))
+    noise: LatentPrior = field(default_factory=LatentPrior)
     """Prior on the latent noise, as in path following."""
+    liveliness: float = 0.35
+    """Standard deviation of the noise that is drawn once for each frame, about which the prior of a walk is centred, as
+    in path following."""
 
     def scaled_to(self, character: Character) -> "SteerSettings":
         """Return the settings for a character of this size, in metres of the prior's size."""
@@ -213,6 +217,8 @@ class SteerState:
     """Steering target of the last delivered frame, in the prior's size."""
     past_targets: Float[Tensor, "past 2"]
     """Target velocities of the last delivered frames, oldest first, m/s in the prior's size."""
+    seed: int = 0
+    """Seed of the noise that is drawn for walks."""
     frames: int = 1
     """Frames delivered so far, the first pose included."""
     terms: tuple[Term, ...] = ()
@@ -303,8 +309,9 @@ def begin(
         forecast=start.committed.joints_world[:0],
     )
     past_targets, unit_terms = torch.tensor([target.velocity]), tuple(character.term(term) for term in terms)
+    seed = int(torch.randint(2**31, (), generator=generator))
     return SteerState(
-        prior, chosen.scaled_to(character), character, start.committed, target, past_targets, terms=unit_terms
+        prior, chosen.scaled_to(character), character, start.committed, target, past_targets, seed, terms=unit_terms
     ), frames
 
 
@@ -477,24 +484,28 @@ def _limit_evaluations(state: SteerState, evaluations: int, seconds: float | Non
 
 
 def _find_steps(state: SteerState, command: Command) -> PlannedSteps | None:
-    """Find the planned steps from which the search starts: those under way, or new ones, of a body whose command leads
-    to no walk or that is at rest and is to stand."""
-    steps, limits = state.steps, state.settings.limits
+    """Find the planned steps from which the search starts: those under way, or new ones where the command leads to no
+    walk, or to a stand."""
+    steps = state.steps
     if steps is not None and steps.obey(command):
         return steps
-    needed = needs_steps(command, float(state.committed.ground_pose.heading))
-    if command.speed > 0 and needed and float(_recent_velocity(state, _REST_FRAMES).norm()) < _FASTEST_PLANNED:
-        stand = _find_mean_stand(state, command)
-        return plan_travel(_find_pose(state), state.committed.joints_world, stand, command, limits)
-    ended = steps is not None and steps.ended
-    if command.speed > 0 or not (ended or _is_at_rest(state)) or not (needed or (state.stand is None and not ended)):
+    needed, stands = needs_steps(command, float(state.committed.ground_pose.heading)), _stands(state)
+    if not needed and (stands or command.speed > 0 or command.turning is not None):
         return None
-    return plan_turn(_find_pose(state), _find_mean_stand(state, command), command.hips_heading, limits)
+    if float(_recent_velocity(state, _REST_FRAMES).norm()) > _FASTEST_PLANNED:
+        return None
+    stand, limits = _find_mean_stand(state, command), state.settings.limits
+    return plan_steps(_find_pose(state), state.committed.joints_world, stand, command, limits)
+
+
+def _stands(state: SteerState) -> bool:
+    """Return whether the body has come to a stand."""
+    return state.stand is not None or (state.steps is not None and state.steps.ended)
 
 
 def _find_stand(state: SteerState, command: Command) -> Stand | None:
     """Find the stand of a body at rest that is to stand as it does."""
-    if command.speed > 0 or command.turning is not None or not _is_at_rest(state):
+    if command.speed > 0 or command.turning is not None or not (_stands(state) or _is_at_rest(state)):
         return None
     return state.stand or Stand(_find_pose(state), _find_mean_stand(state, command))
 
@@ -595,8 +606,17 @@ def _build_steering_terms(
         sigma_direction=settings.sigma_direction,
         sigma_facing=sigma_facing,
     )
-    terms = settings.noise, velocity, settings.footing
+    wide = replace(settings.noise, sigma=_PLANNED_NOISE * settings.noise.sigma)
+    noise = wide if state.steps else replace(settings.noise, centre=_draw_noise(state))
+    terms = noise, velocity, settings.footing
     return (*terms, StepLength(step_length, sigma=settings.sigma_step)) if step_length else terms
+
+
+def _draw_noise(state: SteerState) -> Float[Tensor, "frames continuous"]:
+    """Draw the noise of a window: that of a frame is the same in every window."""
+    frames, one = range(state.frames, state.frames + state.settings.horizon), torch.Generator()
+    drawn = [torch.randn(LAYOUT.continuous, generator=one.manual_seed(state.seed + frame)) for frame in frames]
+    return state.settings.liveliness * torch.stack(drawn)
 
 
 def _relax_footing_first(

@@ -21,23 +21,19 @@ from controllers.shots.footsteps import (
     Footstep,
     Swing,
     measure_strain,
-    plan_footsteps,
     pose_hips,
     stand_on,
     sway_from,
     swing_foot,
-    take_steps,
 )
 from mapctl import rotations
 from mapctl.features import LAYOUT, PRIOR_FPS, encode
 from mapctl.intent.steering import Command, SteeringLimits, SteeringTarget
-from mapctl.kinematics.moving import move_to, rotate_about_vertical
 from mapctl.motion import Motion
 from mapctl.numerics.easing import smootherstep
 from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL, FEET, TOES, leg_length
 
-_STEP_FRAMES = 11  # of a step of a turn on the spot, or into a stand
 _OFF_FACING = math.radians(35)  # between travel and facing, from which on travel is no walk
 _TURNED = math.radians(8)  # from which on a standing body turns
 _SAME_SPEED, _SAME_ANGLE = 0.1, math.radians(10)  # m/s and radians by which a command may change while steps obey it
@@ -98,93 +94,107 @@ class PlannedSteps:
         return replace(self, taken=self.taken + frames)
 
 
-def plan_turn(pose: Motion, stand: Motion, facing: float, limits: SteeringLimits) -> PlannedSteps | None:
-    """Plan the steps of a body at rest into a stand that faces elsewhere, radians; the stand is given at the pose's
-    ground position and heading. None where no foot has to move."""
-    heading = float(BodyPose.of_motion(pose).heading[0])
-    turn = _wrap(facing - heading)
-    here = torch.tensor([*pose.root_position[0, ::2].tolist(), heading], dtype=torch.float64)
-    track = torch.stack([here, here + here.new_tensor([0.0, 0.0, turn])])
-    move = Displacement.between(pose, move_to(rotate_about_vertical(stand, turn), here[:2]), track)
-    frames = _STEP_FRAMES * move.count_steps() + 3
-    steps = plan_footsteps(move, frames, least=2 if move.moves_feet else 0)
-    if not steps:
-        return None
-    command, start = Command(0.0, facing), SteeringTarget(0.0, facing, heading)
-    targets = start.ahead(command, limits, frames=frames, fps=PRIOR_FPS)
-    return PlannedSteps(command, encode(take_steps(move, steps, frames))[0][1:].float(), targets)
-
-
-_POSED = 30  # frames within which trunk and arms come to the pose of the travel
+_QUICK = 12  # frames from one step to the next into a stand
 _LANDING = 9  # frames that a swing under way still takes
+_POSED = 30  # frames within which trunk and arms come to the pose of the stand
+_THERE, _FACED = 0.05, math.radians(8)  # metres and radians from where hips come to rest: feet are put there at once
+_MOVED = 0.03  # metres from which on a foot is lifted
 _ARM_SWING = 0.7  # radians of an upper arm, for each metre that the foot of its side is ahead of the other one
+_EASE = 8  # frames in which a turn comes to its rate
 
 
-def plan_travel(
+def plan_steps(
     pose: Motion, joints: Float[Tensor, "past joints 3"], stand: Motion, command: Command, limits: SteeringLimits
-) -> PlannedSteps:
-    """Plan steps by which a body travels as commanded, from its pose, at rest or under way; `joints` are the world
-    positions of its last frames, metres.
+) -> PlannedSteps | None:
+    """Plan steps by which a body travels as commanded, or comes to a stand, from its pose, at rest or under way;
+    `joints` are the world positions of its last frames, metres. None where it is to stand and no foot has to move.
 
     Hips travel and turn as the limits allow. Feet alternate beneath them, each put where the hips are in the middle of
     its stance; to a side, both where the hips are between their stances, so that they do not cross. Steps take as long
     as people's who walk backward and to a side (17 frames: the median of the clips of `bandai-namco-1`), or less where
     feet would be too far apart. What repeats is planned once.
     """
-    heading = float(BodyPose.of_motion(pose).heading[0])
-    relative, turn = command.heading - command.hips_heading, _wrap(command.hips_heading - heading)
+    move, targets, settled = _lay_track(pose, joints, stand, command, limits)
+    relative = command.heading - command.hips_heading if command.speed > 0 else 0.0
     aside, lead = math.sin(relative) ** 2, 0 if math.sin(relative) > 0 else 1
-    longest = STEP * leg_length(stand.skeleton) / (1 + aside)
-    period = min(SWING + BOTH, math.floor(longest / command.speed * PRIOR_FPS))
-    speeds = torch.diff(joints[-4:].double(), dim=0) * PRIOR_FPS
-    velocity, toe_velocity = speeds[:, 0, ::2].mean(dim=0), speeds[-1, CANONICAL.indices(TOES)]
-    wanted = command.speed * velocity.new_tensor([math.sin(command.heading), math.cos(command.heading)])
-    change = math.ceil(float((wanted - velocity).norm()) / limits.acceleration * PRIOR_FPS)
-    change, turned = max(1, change), max(1, math.ceil(abs(turn) / limits.turn_rate * PRIOR_FPS))
-    begin = max(change, turned, _POSED) + 2 * period  # of the cycle
-    clock = torch.arange(begin + 6 * period, dtype=torch.float64)
-    velocities = torch.lerp(velocity, wanted, smootherstep((clock / change).clamp(max=1))[:, None])
-    path = pose.root_position[0, ::2] + (velocities.cumsum(dim=0) - velocities[0]) / PRIOR_FPS
-    facing = heading + turn * smootherstep((clock / turned).clamp(max=1))
-    move = Displacement(stand, stand, torch.cat([path, facing[:, None]], dim=1))
-    swinging = int(toe_velocity.norm(dim=-1).argmax())
-    airborne = float(toe_velocity[swinging].norm()) > AIRBORNE
+    period = _QUICK
+    if command.speed > 0:
+        longest = STEP * leg_length(stand.skeleton) / (1 + aside)
+        period = min(SWING + BOTH, math.floor(longest / command.speed * PRIOR_FPS))
     swing = round(SWING / (SWING + BOTH) * period)
-    plans = list[list[Footstep]]()
-    for first in [swinging] if airborne else [0, 1]:
-        plan, land = list[Footstep](), _LANDING if airborne else BOTH + swing
-        while land - swing < len(clock):
+    velocities = torch.diff(joints[-2:, CANONICAL.indices(TOES)].double(), dim=0).reshape(-1, 3) * PRIOR_FPS
+    airborne = [foot for foot, velocity in enumerate(velocities) if float(velocity.norm()) > AIRBORNE]
+    airborne = sorted(airborne, key=lambda foot: -float(velocities[foot].norm()))[:1]
+
+    def lay(first: int) -> list[Footstep]:
+        plan, land, frames = list[Footstep](), _LANDING if airborne else BOTH + swing, len(move.track)
+        while land < frames - 2 * period and (command.speed > 0 or [step.share for step in plan[-2:]] != [1.0, 1.0]):
             foot = (first + len(plan)) % 2
             middle = land + period - 0.5 * swing + (0.5 if foot == lead else -0.5) * aside * period
-            plan.append(Footstep(foot, max(0, land - swing), land, min(1.0, middle / (len(clock) - 1))))
+            share = min(1.0, middle / (frames - 1))
+            left = (move.track[-1] - move.hips_at(clock.new_tensor([share]))[0]).abs()
+            if command.speed == 0 and float(left[:2].norm()) < _THERE and float(left[2]) < _FACED:
+                share = 1.0
+            plan.append(Footstep(foot, max(0, land - swing), land, share))
             land += period
-        plans.append(plan)
-    plan = min(plans, key=lambda plan: measure_strain(move, plan))
-    toes, turns, rotation = [], [], pose.joint_rotations()[0]
+        return plan
+
+    clock = torch.arange(len(move.track), dtype=torch.float64)
+    plan = min(map(lay, airborne or [0, 1]), key=lambda plan: measure_strain(move, plan))
+    toes, turns, taken = [], [], list[Footstep]()
     for foot in range(2):
-        steps = [step for step in plan if step.foot == foot]
-        stands = zip(steps, *move.toes_at(foot, clock.new_tensor([step.share for step in steps])), strict=True)
-        swings = [Swing(*each) for each in stands]
-        if airborne and foot == swinging:
-            swings[0] = replace(swings[0], velocity=toe_velocity[foot])
-        toe, turn = swing_foot(
-            clock, pose.joint_positions()[0, CANONICAL.index(TOES[foot])], rotation[CANONICAL.index(FEET[foot])], swings
-        )
-        toes.append(toe)
-        turns.append(turn)
-    sways = sum((sway_from(step, clock) for step in plan), torch.zeros_like(clock))
+        steps, swings = [step for step in plan if step.foot == foot], list[Swing]()
+        toe = begin = pose.joint_positions()[0, CANONICAL.index(TOES[foot])]
+        turn = pose.joint_rotations()[0, CANONICAL.index(FEET[foot])]
+        footholds = move.toes_at(foot, clock.new_tensor([step.share for step in steps]))
+        for step, position, rotation in zip(steps, *footholds, strict=True):
+            last = swings[-1].turn if swings else turn
+            turned = float(rotations.to_rotation_vector(rotations.multiply(rotations.inverse(last), rotation)).norm())
+            in_air = step.lift == 0 and foot in airborne
+            if in_air or float((position - toe).norm()) > _MOVED or turned > _TURNED:
+                swings.append(Swing(step, position, rotation, velocities[foot] if in_air else None))
+                toe = position
+        path, rotation = swing_foot(clock, begin, turn, swings)
+        toes.append(path)
+        turns.append(rotation)
+        taken += [swing.step for swing in swings]
+    if not taken:
+        return None
     weight = smootherstep((clock / _POSED).clamp(max=1))
+    sways = sum((sway_from(step, clock) for step in taken), torch.zeros_like(clock))
     body = pose_hips(pose, stand, move.track, sways, weight)
-    apart = rotations.rotate_about_y(toes[0] - toes[1], -facing)[:, 2]
+    apart = rotations.rotate_about_y(toes[0] - toes[1], -move.track[:, 2])[:, 2]
     for name, side in (("leftUpperArm", 1), ("rightUpperArm", -1)):
         arm, angle = CANONICAL.index(name), side * _ARM_SWING * weight * apart
         swung = rotations.from_rotation_vector(torch.stack([angle, 0 * angle, 0 * angle], dim=-1))
         body.local_quat_xyzw[:, arm] = rotations.multiply(swung, body.local_quat_xyzw[:, arm])
-    motion = stand_on(body, torch.stack(toes, dim=1), torch.stack(turns, dim=1))
-    speed, direction = velocities.norm(dim=-1), torch.atan2(velocities[:, 0], velocities[:, 1])
-    targets = [SteeringTarget(*each) for each in torch.stack([speed, direction, facing], dim=1)[1 : begin + 1].tolist()]
-    features = encode(motion)[0][1 : begin + 2 * period + 1].float()
-    return PlannedSteps(command, features, targets, cycle=2 * period)
+    features = encode(stand_on(body, torch.stack(toes, dim=1), torch.stack(turns, dim=1)))[0][1:].float()
+    cycle = 2 * period if command.speed > 0 else 0
+    frames = max(settled, _POSED) + 2 * cycle if cycle else max(step.land for step in taken) + 2
+    return PlannedSteps(command, features[:frames], targets[:frames], cycle)
+
+
+def _lay_track(
+    pose: Motion, joints: Float[Tensor, "past joints 3"], stand: Motion, command: Command, limits: SteeringLimits
+) -> tuple[Displacement, list[SteeringTarget], int]:
+    """Lay where hips are frame by frame from now on, as fast as the limits allow; with their steering targets, and the
+    frame from which on nothing changes."""
+    heading = float(BodyPose.of_motion(pose).heading[0])
+    velocity = torch.diff(joints[-4:, 0, ::2].double(), dim=0).sum(dim=0) * PRIOR_FPS / max(1, len(joints[-4:]) - 1)
+    wanted = command.speed * velocity.new_tensor([math.sin(command.heading), math.cos(command.heading)])
+    turn, rate = _wrap(command.hips_heading - heading), limits.acceleration if command.speed > 0 else limits.braking
+    change = max(1, math.ceil(float((wanted - velocity).norm()) / rate * PRIOR_FPS))
+    turned = _EASE + math.ceil(abs(turn) / limits.turn_rate * PRIOR_FPS)
+    settled = max(change, turned)
+    clock = torch.arange(max(settled, _POSED) + 8 * (SWING + BOTH), dtype=torch.float64)
+    travel = torch.lerp(velocity, wanted, (clock / change).clamp(max=1)[:, None])
+    path = pose.root_position[0, ::2] + (travel.cumsum(dim=0) - travel[0]) / PRIOR_FPS
+    rates = torch.minimum(clock, turned - clock).clamp(0, _EASE)
+    facing = heading + turn * rates.cumsum(dim=0) / rates.sum()
+    direction = torch.where(travel.norm(dim=-1) > 0, torch.atan2(travel[:, 0], travel[:, 1]), facing)
+    rows = torch.stack([travel.norm(dim=-1), direction, facing], dim=1)[1:].tolist()
+    move = Displacement(stand, stand, torch.cat([path, facing[:, None]], dim=1))
+    return move, [SteeringTarget(*row) for row in rows], settled
 
 
 def _wrap(angle: float) -> float:

@@ -56,6 +56,7 @@ class FollowCurve(ModelCommand, options.ReadOptions, ShotOptions):
 def run(command: FollowCurve) -> int:
     """Check everything, solve, write, report. Ctrl-C ends the solve; the motion so far is written, without a film."""
     options.check_seed(command.seed)
+    options.check_liveliness(command.liveliness)
     if command.fps is not None and not 1 <= command.fps <= 1000:
         raise RequestError(f"--fps must be 1 to 1000, got {command.fps:g}")
     options.check_variations(command.variations)

@@ -53,6 +53,7 @@ class Live(ModelCommand, options.ReadOptions, streaming.StreamOptions):
     """A bundled prior, or the file or run folder of a trained one."""
     seed: options.Count = 0
     """Seed of the first poses."""
+    liveliness: options.Liveliness = SteerSettings.liveliness
     listen: options.MaybeEndpoint = None
     """Where commands come from over OSC, as /mapctl/speed 1.4 (docs/guides/streaming.md): a port alone takes those of
     this machine; 0.0.0.0:PORT takes those of every machine."""
@@ -120,6 +121,7 @@ def _open_app(command: Live, receiver: "OscReceiver | None") -> "tuple[LiveApp, 
 
 def _check(command: Live) -> None:
     options.check_seed(command.seed)
+    options.check_liveliness(command.liveliness)
     if not 1 <= command.port <= 65535:
         raise RequestError(f"the port must be a number from 1 to 65535, got {command.port}")
     if not 1 <= command.characters <= _MAX_CHARACTERS:
@@ -174,7 +176,7 @@ def _start_characters(command: Live, bodies: Sequence[Character]) -> Sequence[Ch
                 Command(1.2, 0.0),
                 command.seed + number,
                 at,
-                SteerSettings(footing=FootContact(rest_height=own.toe_rest_height)),
+                SteerSettings(liveliness=command.liveliness, footing=FootContact(rest_height=own.toe_rest_height)),
                 own.skeleton,
                 transitions=functools.partial(priors.load_stitcher, priors.add_set(_STITCHER)),
             )

@@ -70,6 +70,7 @@ class Steer(ModelCommand, options.ReadOptions, streaming.StreamOptions):
     rig: options.OutRig = "canonical"
     """Body that moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by name
     or TOML file, whose joints get the canonical bones."""
+    liveliness: options.Liveliness = steer.SteerSettings.liveliness
     avoid: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="X,Z,RADIUS")] = ()
     """A disc on the ground to walk around, metres; may be given several times."""
     seed: options.Count = 0
@@ -111,6 +112,7 @@ _LAST_COMMAND_SECONDS = 3.0  # seconds for which a script of a single command is
 def run(command: Steer) -> int:
     """Check everything, steer, write, report. Ctrl-C ends the script early; the motion so far is written."""
     options.check_seed(command.seed)
+    options.check_liveliness(command.liveliness)
     limits = SteeringLimits(command.acceleration, command.braking, math.radians(command.turn_rate))
     formats.check_ending(command.out)
     outputs.check_files(options.collect_paths(command.out, command.report))
@@ -127,7 +129,8 @@ def run(command: Steer) -> int:
         stepper = Arriver(priors.load_stitcher(command.stitcher or "stitcher"))
     elif command.stitcher is not None:
         raise RequestError("--stitcher is for goto_x_m, which the script does not have; leave it out")
-    settings = steer.SteerSettings(limits=limits, footing=FootContact(rest_height=character.toe_rest_height))
+    footing = FootContact(rest_height=character.toe_rest_height)
+    settings = steer.SteerSettings(limits=limits, liveliness=command.liveliness, footing=footing)
     stream = streaming.open_stream(command, [character.skeleton])
     try:
         recorder, records, frames = _run_steering(command, prior, track, character, settings, stepper, stream)

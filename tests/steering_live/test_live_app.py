@@ -83,7 +83,8 @@ def test_frames_are_shown_where_they_say_and_the_world_moves_past_the_camera(sho
     show.chosen.character.poll = lambda: [chunk]
     run(show, 3)
     position = show.chosen.position
-    assert position.tolist() in chunk.root[:, ::2].tolist()
+    assert position[0] == 0
+    assert chunk.root[0, 2] <= position[1] <= chunk.root[-1, 2]
     assert np.dot(show.view._world.position[[0, 2]], position) < 0
     assert "frames late" in show.chosen.describe_status()
     assert re.search(r"facing (2[6-9]|3[01])° off", show.chosen.describe_status())  # of 0.5 radians

@@ -19,6 +19,8 @@ Number = Annotated[float, arg(metavar="NUMBER")]
 Count = Annotated[int, arg(metavar="N")]
 Name = Annotated[str, arg(metavar="NAME")]
 Prior = Annotated[str, arg(metavar="NAME", help="A bundled prior, or the file or run folder of a trained one.")]
+_LIVELINESS = "Variety of walks: 0 is the most probable one, smoother than people walk; 1 is as varied as the prior."
+Liveliness = Annotated[float, arg(metavar="0..1", help=_LIVELINESS)]
 Quiet = Annotated[bool, arg(help="No summary and no progress bar.")]
 MaybeSpeed = Annotated[str | None, arg(metavar="M/S|ARC:M/S,...")]
 MaybeFile = Annotated[Path | None, arg(metavar="FILE")]
@@ -90,6 +92,12 @@ def check_seed(seed: int) -> None:
     """Raise RequestError unless torch can take the seed."""
     if not 0 <= seed < 2**63:
         raise RequestError(f"the seed must be a whole number from 0 to 2^63 - 1, got {seed}")
+
+
+def check_liveliness(liveliness: float) -> None:
+    """Raise RequestError unless the liveliness is from 0 to 1."""
+    if not 0 <= liveliness <= 1:
+        raise RequestError(f"--liveliness must be 0 to 1, got {liveliness:g}")
 
 
 def check_variations(count: int) -> None:

@@ -267,7 +267,7 @@ def play_shot(
     if keep_apart is not None and earlier:
         tracks = [(one.plan, one.solution.motion.root_position[:, ::2]) for one in earlier]
         plan = replace(plan, request=replace(plan.request, others=_find_others(plan, tracks, keep_apart)))
-    settings = FollowSettings().with_rest_height(plan.character.toe_rest_height)
+    settings = FollowSettings(liveliness=plan.actor.liveliness).with_rest_height(plan.character.toe_rest_height)
     solution = solve_shot(
         plan.prior,
         None if plan.request.walks_only else priors.load_inbetweener(),
