@@ -181,16 +181,15 @@ class Displacement:
         )
 
 
-def plan_footsteps(displacement: Displacement, frames: int, *, least: int = 0) -> list[Footstep]:
-    """Plan the steps of a displacement within so many frames at PRIOR_FPS, `least` of them at least; none where no foot
-    has to move.
+def plan_footsteps(displacement: Displacement, frames: int) -> list[Footstep]:
+    """Plan the steps of a displacement within so many frames at PRIOR_FPS; none where no foot has to move.
 
     Feet alternate; to a side, one may also follow the other. Of the plans that begin with either foot the one counts
     whose feet are least apart at most, and do not cross: the first is on the side to which the body turns or steps.
     """
-    if not least and displacement.distance < _MOVED and displacement.turn < _TURNED:
+    if displacement.distance < _MOVED and displacement.turn < _TURNED:
         return []
-    count = max(displacement.count_steps(), frames // _SLOWEST, least)
+    count = max(displacement.count_steps(), frames // _SLOWEST)
     plans = [_lay_steps([(first + number) % 2 for number in range(count)], frames) for first in range(2)]
     if displacement.leads_aside:
         plans += [_lay_side_steps(displacement, first, frames) for first in range(2)]

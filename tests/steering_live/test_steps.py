@@ -12,7 +12,7 @@ import priors
 from controllers.steering import steer
 from controllers.steering.loop import Recorder, drive
 from controllers.steering.stand import Stand, find_stand
-from controllers.steering.steps import PlannedSteps, needs_steps, plan_travel, plan_turn
+from controllers.steering.steps import PlannedSteps, needs_steps, plan_steps
 from mapctl import rotations
 from mapctl.features import PRIOR_FPS, GroundPose
 from mapctl.intent.steering import Command, CommandTrack, SteeringLimits
@@ -46,6 +46,17 @@ def play(features):
     return decode(features.double(), GroundPose(HERE.position_xz.double(), HERE.heading.double()))
 
 
+def walk_before(stand, speed):
+    """Joints of the last frames of a body whose hips went ahead over its feet, m/s."""
+    step = torch.tensor([math.sin(AHEAD), 0.0, math.cos(AHEAD)]) * speed / PRIOR_FPS
+    joints, feet = (
+        stand.joint_positions() + torch.arange(-5, 1)[:, None, None] * step,
+        CANONICAL.indices((*TOES, *FEET)),
+    )
+    joints[:, feet] = stand.joint_positions()[:, feet]
+    return joints
+
+
 def find_worst_feet(motion):
     positions = motion.joint_positions()
     assert float(positions[:, CANONICAL.indices(TOES), 1].min()) > TOE_REST_HEIGHT - 0.005
@@ -60,11 +71,8 @@ def find_worst_feet(motion):
 def test_a_body_travels_as_commanded_on_feet_that_stand(stand, speed, travel, turn, moving):
     """From a stand, and from walking ahead; angles are from the facing at the start, radians."""
     command = Command(speed, AHEAD + travel, AHEAD + turn)
-    step = torch.tensor([math.sin(AHEAD), 0.0, math.cos(AHEAD)]) * moving / PRIOR_FPS
-    feet = CANONICAL.indices((*TOES, *FEET))
-    joints = stand.joint_positions() + torch.arange(-5, 1)[:, None, None] * step
-    joints[:, feet] = stand.joint_positions()[:, feet]
-    steps = plan_travel(stand, joints, stand, command, SteeringLimits())
+    steps = plan_steps(stand, walk_before(stand, moving), stand, command, SteeringLimits())
+    assert steps is not None
     motion = play(steps.window(240))
     went = (motion.root_position[-1] - motion.root_position[-1 - steps.cycle])[::2] * PRIOR_FPS / steps.cycle
     wanted = speed * torch.tensor([math.sin(command.heading), math.cos(command.heading)], dtype=went.dtype)
@@ -92,7 +100,8 @@ def test_arms_swing_against_legs_and_a_foot_in_the_air_goes_on(stand):
     joints = stand.joint_positions().expand(4, -1, 3).clone()
     right = CANONICAL.index("rightToes")
     joints[-2, right] -= torch.tensor([math.sin(AHEAD), 0.0, math.cos(AHEAD)]) * 1.5 / PRIOR_FPS
-    steps = plan_travel(stand, joints, stand, Command(0.8, AHEAD + math.pi, AHEAD), SteeringLimits())
+    steps = plan_steps(stand, joints, stand, Command(0.8, AHEAD + math.pi, AHEAD), SteeringLimits())
+    assert steps is not None
     motion = play(steps.window(240))
     heading = BodyPose.of_motion(motion).heading
     ahead = rotations.rotate_about_y(motion.joint_positions() - motion.root_position[:, None], -heading[:, None])[
@@ -107,19 +116,33 @@ def test_arms_swing_against_legs_and_a_foot_in_the_air_goes_on(stand):
     assert float(ahead[1, right] - ahead[0, right]) > 0.004
 
 
-@pytest.mark.parametrize("turn", [2.5, -0.6])
-def test_a_turn_on_the_spot_ends_in_a_stand_that_faces_there(stand, turn):
-    steps = plan_turn(stand, stand, AHEAD + turn, SteeringLimits())
+@pytest.mark.parametrize(
+    ("turn", "moving", "frames"), [(2.5, 0.0, 60), (-0.6, 0.0, 40), (0.0, 1.1, 40), (1.0, 0.8, 50)]
+)
+def test_a_body_turns_or_stops_into_a_balanced_stand(stand, turn, moving, frames):
+    steps = plan_steps(stand, walk_before(stand, moving), stand, Command(0.0, AHEAD + turn), SteeringLimits())
     assert steps is not None
-    motion = play(steps.features)
-    assert float((motion.root_position[-1, ::2] - HERE.position_xz).norm()) < 0.01
+    assert len(steps.features) < frames
+    motion = play(steps.window(len(steps.features) + 5))
+    went = moving**2 / 2 / SteeringLimits.braking
+    assert float((motion.root_position[-1, ::2] - HERE.position_xz).norm()) == pytest.approx(went, abs=0.03)
+    assert torch.equal(motion.root_position[-5], motion.root_position[-1])
     assert float(BodyPose.of_motion(motion).heading[-1]) == pytest.approx(AHEAD + turn, abs=0.01)
     worst = find_worst_feet(motion)
     assert worst["glide_cm"] < 1
     assert worst["slide_max_cm"] < 1.5
     assert worst["unsupported_max_s"] == 0
+    toes = motion.joint_positions()[-1, CANONICAL.indices(TOES)] - motion.root_position[-1]
+    wanted = stand.joint_positions()[0, CANONICAL.indices(TOES)] - stand.root_position[0]
+    assert (
+        float((rotations.rotate_about_y(wanted, torch.tensor(turn).double()) - toes)[:, ::2].norm(dim=-1).max()) < 0.06
+    )
     assert steps.after(len(steps.features)).ended
     assert not steps.after(1).ended
+
+
+def test_a_body_that_stands_as_it_is_to_takes_no_step(stand):
+    assert plan_steps(stand, walk_before(stand, 0.0), stand, Command(0.0, AHEAD), SteeringLimits()) is None
 
 
 @pytest.mark.parametrize(
