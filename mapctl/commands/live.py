@@ -52,7 +52,7 @@ class Live(ModelCommand, options.ReadOptions, streaming.StreamOptions):
     prior: options.Name = "locomotion-live"
     """A bundled prior, or the file or run folder of a trained one."""
     seed: options.Count = 0
-    """Seed of the first poses."""
+    """Seed of the first poses, and of what is drawn for walks."""
     liveliness: options.Liveliness = SteerSettings.liveliness
     listen: options.MaybeEndpoint = None
     """Where commands come from over OSC, as /mapctl/speed 1.4 (docs/guides/streaming.md): a port alone takes those of

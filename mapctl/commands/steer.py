@@ -74,7 +74,7 @@ class Steer(ModelCommand, options.ReadOptions, streaming.StreamOptions):
     avoid: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="X,Z,RADIUS")] = ()
     """A disc on the ground to walk around, metres; may be given several times."""
     seed: options.Count = 0
-    """Seed of the first pose."""
+    """Seed of the first pose, and of what is drawn for walks."""
     acceleration: options.Number = SteeringLimits.acceleration
     """Largest acceleration of the target speed, m/s^2."""
     braking: options.Number = SteeringLimits.braking
