@@ -95,6 +95,7 @@ class PlannedSteps:
 
 
 _QUICK = 12  # frames from one step to the next into a stand
+_FASTEST = 6  # frames from one step to the next at least: faster travel is as fast as that
 _LANDING = 9  # frames that a swing under way still takes
 _POSED = 30  # frames within which trunk and arms come to the pose of the stand
 _THERE, _FACED = 0.05, math.radians(8)  # metres and radians from where hips come to rest: feet are put there at once
@@ -112,15 +113,16 @@ def plan_steps(
     Hips travel and turn as the limits allow. Feet alternate beneath them, each put where the hips are in the middle of
     its stance; to a side, both where the hips are between their stances, so that they do not cross. Steps take as long
     as people's who walk backward and to a side (17 frames: the median of the clips of `bandai-namco-1`), or less where
-    feet would be too far apart. What repeats is planned once.
+    feet would be too far apart, but no less than 6: faster travel is not planned. What repeats is planned once.
     """
-    move, targets, settled = _lay_track(pose, joints, stand, command, limits)
     relative = command.heading - command.hips_heading if command.speed > 0 else 0.0
     aside, lead = math.sin(relative) ** 2, 0 if math.sin(relative) > 0 else 1
-    period = _QUICK
-    if command.speed > 0:
-        longest = STEP * leg_length(stand.skeleton) / (1 + aside)
-        period = min(SWING + BOTH, math.floor(longest / command.speed * PRIOR_FPS))
+    longest, period = STEP * leg_length(stand.skeleton) / (1 + aside), _QUICK
+    speed = min(command.speed, longest / _FASTEST * PRIOR_FPS)
+    if speed > 0:
+        period = min(SWING + BOTH, math.floor(longest / speed * PRIOR_FPS + 1e-6))
+    move, targets, settled = _lay_track(pose, joints, stand, replace(command, speed=speed), limits)
+    clock = torch.arange(len(move.track), dtype=torch.float64)
     swing = round(SWING / (SWING + BOTH) * period)
     velocities = torch.diff(joints[-2:, CANONICAL.indices(TOES)].double(), dim=0).reshape(-1, 3) * PRIOR_FPS
     airborne = [foot for foot, velocity in enumerate(velocities) if float(velocity.norm()) > AIRBORNE]
@@ -139,7 +141,6 @@ def plan_steps(
             land += period
         return plan
 
-    clock = torch.arange(len(move.track), dtype=torch.float64)
     plan = min(map(lay, airborne or [0, 1]), key=lambda plan: measure_strain(move, plan))
     toes, turns, taken = [], [], list[Footstep]()
     for foot in range(2):

@@ -141,6 +141,17 @@ def test_a_body_turns_or_stops_into_a_balanced_stand(stand, turn, moving, frames
     assert not steps.after(1).ended
 
 
+def test_travel_is_no_faster_than_feet_can_step(stand):
+    command = Command(4.0, AHEAD + math.pi / 2, AHEAD)
+    steps = plan_steps(stand, walk_before(stand, 0.0), stand, command, SteeringLimits())
+    assert steps is not None
+    assert 1.0 < steps.targets[-1].speed < 2.0
+    assert steps.obey(command)
+    toes = play(steps.window(120)).joint_positions()[:, CANONICAL.indices(TOES)]
+    assert float((toes[:, 0] - toes[:, 1]).norm(dim=-1).max()) < 0.85
+    assert float(torch.diff(toes[:, :, ::2], dim=0).norm(dim=-1).max()) * PRIOR_FPS < 8
+
+
 def test_a_body_that_stands_as_it_is_to_takes_no_step(stand):
     assert plan_steps(stand, walk_before(stand, 0.0), stand, Command(0.0, AHEAD), SteeringLimits()) is None
 
