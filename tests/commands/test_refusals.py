@@ -141,6 +141,7 @@ CASES = {
     f"{FOLLOW} --seconds -3": "seconds must be positive, got -3",
     f"{FOLLOW} --seconds 1e9": "fewer seconds",
     f"{FOLLOW} --seed -1": "seed",
+    f"{FOLLOW} --liveliness 1.5": "liveliness",
     f"{FOLLOW} --seed {2**63}": "seed",
     f"{FOLLOW} --metres-per-unit 2": "metres per unit",
     f"{FOLLOW} --fps 0": "--fps must be 1 to 1000",

@@ -51,6 +51,17 @@ def test_a_step_delivers_its_frames_with_a_forecast_and_a_ledger():
     assert float(ahead.norm()) < 0.3
 
 
+def test_walks_differ_by_their_seed_as_far_as_they_are_lively():
+    """One noise belongs to a frame, whichever window it is in."""
+    for liveliness in (0.0, 0.5):
+        state, _ = begun(settings=replace(QUICK, liveliness=liveliness))
+        one, other = (steer.step(replace(state, seed=seed), AHEAD)[1].motion.root_position for seed in (1, 2))
+        assert torch.equal(one, other) == (liveliness == 0)
+    now, later = (steer._draw_noise(replace(state, frames=frames)) for frames in (4, 7))
+    assert torch.equal(now[3:], later[:-3])
+    assert float(now.std()) == pytest.approx(0.5, rel=0.2)
+
+
 @pytest.mark.parametrize("least", [0, 2])
 def test_without_time_it_still_delivers_with_a_note(least):
     state, _ = begun(settings=replace(QUICK, least_evaluations=least))
