@@ -435,7 +435,7 @@ def warm_up(state: SteerState, commands: Iterable[Command], *, stepper: Stepper 
 
 
 def save(state: SteerState) -> bytes:
-    """Pickle a state without its prior, about 50 kB; work on an arrival is finished first. With its prior, and whole,
+    """Pickle a state without its prior, 40 to 80 kB; work on an arrival is finished first. With its prior, and whole,
     a state can be pickled and copied as any value."""
     return pickle.dumps({name: value for name, value in vars(state).items() if name != "prior"})
 

@@ -172,7 +172,7 @@ def plan_steps(
     features = encode(stand_on(body, torch.stack(toes, dim=1), torch.stack(turns, dim=1)))[0][1:].float()
     cycle = 2 * period if command.speed > 0 else 0
     frames = max(settled, _POSED) + 2 * cycle if cycle else max(step.land for step in taken) + 2
-    return PlannedSteps(command, features[:frames], targets[:frames], cycle)
+    return PlannedSteps(command, features[:frames].clone(), targets[:frames], cycle)
 
 
 def _lay_track(
