@@ -45,7 +45,7 @@ class PartTrack:
     weight: MinimumJerkTrack
     """Share of the distance, 0 to 1."""
     position: MinimumJerkTrack
-    """Place in the world, metres."""
+    """Position in the world, metres."""
 
     @staticmethod
     def begin(position: tuple[float, float, float]) -> "PartTrack":

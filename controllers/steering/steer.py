@@ -87,7 +87,7 @@ _PAST_TARGET_FRAMES = 60  # past targets that are kept: more than the root veloc
 _RECENT_FRAMES = 15  # frames, half a second, over which the velocity error is measured
 _REST_FRAMES = 8  # over which a body at rest hardly goes
 _WIDER = 2.0  # times that the prior is, along planned steps and in starts, which it takes for less likely than they are
-_ENOUGH = 1e-2  # share of the energy: a search ends where an iteration wins less, which spares a quarter of them
+_ENOUGH = 1e-2  # share of the energy: a search ends where an iteration wins less
 _FASTEST_PLANNED = 1.5  # m/s beyond which a body slows down before its steps are planned
 _MIN_TRAVEL_SPEED = 0.3  # m/s below which the velocity has no direction
 _SIGMA_LEAVING = (
@@ -278,7 +278,7 @@ def begin(
     skeleton: Skeleton = CANONICAL,
     terms: Sequence[Term] = (),
 ) -> tuple[SteerState, SteerFrames]:
-    """Place a character at x and z (metres) that faces along the command, and return its first pose.
+    """Put a character at x and z (metres) that faces along the command, and return its first pose.
 
     The generator samples it from the prior's initial states near the command's speed and with its labels; the slowest
     for a command to stand. `terms` are the caller's own, the same in every step; they see the character at its own size
@@ -435,7 +435,7 @@ def warm_up(state: SteerState, commands: Iterable[Command], *, stepper: Stepper 
 
 
 def save(state: SteerState) -> bytes:
-    """Pickle a state without its prior, 40 to 80 kB; work on an arrival is finished first. With its prior, and whole,
+    """Pickle a state without its prior; work on an arrival is finished first. With its prior, and whole,
     a state can be pickled and copied as any value."""
     return pickle.dumps({name: value for name, value in vars(state).items() if name != "prior"})
 

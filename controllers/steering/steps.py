@@ -111,9 +111,9 @@ def plan_steps(
     `joints` are the world positions of its last frames, metres. None where it is to stand and no foot has to move.
 
     Hips travel and turn as the limits allow. Feet alternate beneath them, each put where the hips are in the middle of
-    its stance; to a side, both where the hips are between their stances, so that they do not cross. Steps take as long
-    as people's who walk backward and to a side (17 frames: the median of the clips of `bandai-namco-1`), or less where
-    feet would be too far apart, but no less than 6: faster travel is not planned. What repeats is planned once.
+    its stance; to a side, both where the hips are between their stances, so that they do not cross. Steps follow each
+    other as in any displacement, or sooner where feet would be too far apart, but no sooner than they can: faster
+    travel is not planned. What repeats is planned once.
     """
     relative = command.heading - command.hips_heading if command.speed > 0 else 0.0
     aside, lead = math.sin(relative) ** 2, 0 if math.sin(relative) > 0 else 1

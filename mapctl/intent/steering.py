@@ -107,7 +107,7 @@ class Command:
     reach: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     """Positions in the world that hands are to reach while they come past, metres, by REACHING_HANDS."""
     look_at: tuple[float, float, float] | None = None
-    """Place in the world that is to be looked at, metres."""
+    """Position in the world that is to be looked at, metres."""
     obstacles: tuple[Obstacle, ...] = ()
     """Discs and boxes on the ground to walk round."""
     arrival: Arrival | None = None
