@@ -36,9 +36,10 @@ def inverse(quat_xyzw: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
 
 def rotate(quat_xyzw: Float[Tensor, "*#batch 4"], vector: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3"]:
     """Rotate vectors by quaternions of any length but zero."""
-    back = inverse(quat_xyzw) / (quat_xyzw**2).sum(dim=-1, keepdim=True)
-    pure = torch.cat((vector, vector.new_zeros(*vector.shape[:-1], 1, dtype=quat_xyzw.dtype)), dim=-1)
-    return multiply(quat_xyzw, multiply(pure, back))[..., :3]
+    axis, vector = torch.broadcast_tensors(quat_xyzw[..., :3], vector)
+    across = torch.cross(axis, vector, dim=-1)
+    turned = quat_xyzw[..., 3:] * across + torch.cross(axis, across, dim=-1)
+    return vector + 2 * turned / quat_xyzw.square().sum(dim=-1, keepdim=True)
 
 
 def from_rotation_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
