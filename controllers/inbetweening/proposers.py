@@ -43,7 +43,7 @@ from mapctl.numerics.smooth_offsets import interpolate_offsets, interpolate_turn
 from mapctl.pose import decode
 from mapctl.problem import density_selection
 from mapctl.problem.receding_horizon import CommittedFrames, RecedingHorizonSolver, replay
-from mapctl.problem.window_solvers import LatentNoiseSolver, SolvedWindow, SteeringKnots, SwarmProposal
+from mapctl.problem.window_solvers import LatentNoiseSolver, SolvedWindow, SwarmProposal
 from mapctl.protocols import Density, DensityState, Inbetweener
 from mapctl.recording.masks import MissingMask
 from mapctl.skeleton import CANONICAL, LIMBS, TOE_JOINTS, TOES
@@ -533,7 +533,7 @@ ROLLOUT_SOLVER = LatentNoiseSolver(
     rounds=2,
     lbfgs=LbfgsSettings(max_iterations=24),
     budget=Budget(evaluations=96),
-    proposal=SwarmProposal(SwarmSettings(particles=8, iterations=5), SteeringKnots(knots=4, spread=0.7)),
+    proposal=SwarmProposal(SwarmSettings(particles=8, iterations=5)),
 )
 """Search of rollouts: a swarm, and L-BFGS after it."""
 

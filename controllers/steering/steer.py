@@ -32,21 +32,12 @@ from mapctl.motion import Motion
 from mapctl.pose import BodyPose, decode
 from mapctl.problem.receding_horizon import CommittedFrames, HorizonSettings, RecedingHorizonSolver, replay
 from mapctl.problem.solution import Ledger, Outcome, Solution, Status
-from mapctl.problem.unknowns import WindowRequest
-from mapctl.problem.window_solvers import (
-    GuidedNoiseSolver,
-    LatentNoiseSolver,
-    SingleWindowSolver,
-    SolvedWindow,
-    SteeringKnots,
-    SwarmProposal,
-)
+from mapctl.problem.window_solvers import GuidedNoiseSolver, LatentNoiseSolver, SingleWindowSolver
 from mapctl.protocols import Density
 from mapctl.runtime.stepwise import StepwiseWork
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings, LbfgsStatus
-from mapctl.solver.swarm import SwarmSettings
 from mapctl.terms import FootContact, KeepClear, LatentPrior, RootVelocity, StepLength, Term
 
 _BODY = 0.4  # metres from an obstacle's edge to the hips that pass it
@@ -84,34 +75,27 @@ KEPT_FRAMES = 11
 """Last frames whose features are kept: an arrival continues from them."""
 _JUDGED_FRAMES = 60  # that are kept for terms that look back
 _PAST_TARGET_FRAMES = 60  # past targets that are kept: more than the root velocity term looks back on
-_RECENT_FRAMES = 15  # frames, half a second, over which the velocity error is measured
 _REST_FRAMES = 8  # over which a body at rest hardly goes
-_WIDER = 2.0  # times that the prior is, along planned steps and in starts, which it takes for less likely than they are
+_WIDER = 2.0  # times that the prior is along planned steps, which it takes for less likely than they are
 _ENOUGH = 1e-2  # share of the energy: a search ends where an iteration wins less
 _FASTEST_PLANNED = 1.5  # m/s beyond which a body slows down before its steps are planned
-_MIN_TRAVEL_SPEED = 0.3  # m/s below which the velocity has no direction
-_SIGMA_LEAVING = (
-    0.1  # radians, of the hips' heading in a start, which finds its first step sooner where they turn first
-)
-_FAR_TURN, _LEAVING_TURN = math.radians(75), 1.6  # beyond which a start may turn faster than the limits, and how much
 _NEAREST_STARTS = 6  # initial states nearest to the requested speed, of which one is sampled
 _RISE, _FALL = 0.1, 0.4  # share of the last step in what is expected: another process makes steps longer, none shorter
 _FORGET = 0.9  # of an evaluation's time after a step that had none to make: else there would never be one again
 _LONGEST_REST = 0.02  # seconds: a rest beyond it was interrupted by another process
-_KNOTS, _KNOT_SIGMA = 7, 0.8  # samples: noise of every feature, slow enough for a step
 
 
 @dataclass(frozen=True)
 class SteerSettings:
     """Sigmas, window lengths and budget."""
 
-    horizon: int = 34
+    horizon: int = 24
     """Frames of a window, the look-ahead included."""
     commit: int = 3
     """Frames that a step commits and delivers."""
-    evaluations: int = 8
+    evaluations: int = 6
     """Most evaluations of energy and gradient in a step."""
-    least_evaluations: int = 6
+    least_evaluations: int = 4
     """Evaluations for which the loop gives a step time, however late it is: with fewer, targets are missed
     (docs/reference/results.md). Never more than `evaluations`."""
     limits: SteeringLimits = field(default_factory=SteeringLimits)
@@ -120,17 +104,12 @@ class SteerSettings:
     """Sigma of the speed along the target velocity, m/s."""
     sigma_direction: float = RootVelocity.sigma_direction
     """Sigma of the velocity's direction, radians."""
-    sigma_facing: float = RootVelocity.sigma_facing
+    sigma_facing: float = 0.15
     """Sigma of the hips' heading, radians."""
     sigma_step: float = StepLength.sigma
     """Sigma of a requested step length, metres."""
-    stuck: float = 0.4
-    """Velocity error over the last half second, m/s, beyond which a step is first solved without contacts."""
     standing: float = 0.25
-    """Mean speed over the last half second, m/s, below which a character whose target ahead is faster than it by more
-    than `stuck` is solved that way at once: it would count as stuck half a second later."""
-    random_starts: int = 12
-    """Random warm starts of that solve, evaluated in one batch beside the evaluations; it begins at the best."""
+    """Mean speed of the hips over a quarter of a second, m/s, below which a body is at rest."""
     footing: FootContact = field(default_factory=FootContact)
     """Contact term."""
     noise: LatentPrior = field(default_factory=LatentPrior)
@@ -141,7 +120,7 @@ class SteerSettings:
 
     def scaled_to(self, character: Character) -> "SteerSettings":
         """Return the settings for a character of this size, in metres of the prior's size."""
-        names = "sigma_speed", "sigma_step", "stuck", "standing"
+        names = "sigma_speed", "sigma_step", "standing"
         sigmas = {name: getattr(self, name) / character.scale for name in names}
         return replace(self, limits=character.limits(self.limits), footing=character.footing(self.footing), **sigmas)
 
@@ -342,26 +321,21 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
     if steps is None and needs_steps(command, float(state.committed.ground_pose.heading)):
         command = replace(command, speed=0.0, heading=command.hips_heading)  # it comes to rest first
     state = replace(state, steps=steps, stand=None)
-    stuck = steps is None and _velocity_error(state) > settings.stuck
-    if stuck:
-        state = _restart_target(state)
-    targets, leaving = (steps.targets_of(settings.horizon), False) if steps else _plan_targets(state, command)
+    targets = steps.targets_of(settings.horizon) if steps else _plan_targets(state, command)
     conditioned = replace(state, prior=condition_prior(state.prior, command.labels))
-    free = steps is None and (stuck or leaving)
-    sigma_facing = min(settings.sigma_facing, _SIGMA_LEAVING) if free else settings.sigma_facing
-    if steps is None and not free:
+    if steps is None:
         noise = replace(settings.noise, centre=_draw_noise(state))
     else:
         noise = replace(settings.noise, sigma=_WIDER * settings.noise.sigma)
-    terms = (noise, *_build_steering_terms(state, targets, command.step_length, sigma_facing), *state.terms)
+    terms = (noise, *_build_steering_terms(state, targets, command.step_length), *state.terms)
     if asked.obstacles:
         terms = (*terms, character.term(KeepClear(asked.obstacles)))
     search = None if seconds is None else max(0.0, seconds - state.cost.rest)
-    done, outcome = _solve_step(conditioned, terms, search, free=free)
+    done, outcome = _solve_step(conditioned, terms, search)
     if outcome is not Outcome.DONE:
         cold = replace(state.committed, warm_start=state.committed.warm_start[:0])
         restarted = replace(conditioned, committed=cold, steps=None)
-        done, _ = _solve_step(restarted, terms, 0.0, free=False)  # the prior's own continuation, which always exists
+        done, _ = _solve_step(restarted, terms, 0.0)  # the prior's own continuation, which always exists
     new, record = done.features[-settings.commit :], done.windows[-1]
     cut_short = record.outcome == LbfgsStatus.OUT_OF_BUDGET.value and record.evaluations < settings.evaluations
     note = f"the deadline came after {record.evaluations} of {settings.evaluations} evaluations"
@@ -427,11 +401,9 @@ def _ground_velocity(features: Float[Tensor, "frames size"], start: GroundPose) 
 def warm_up(state: SteerState, commands: Iterable[Command], *, stepper: Stepper | None = None) -> None:
     """Compile, load and condition what steps under commands like these need on first use, for seconds, so that none of
     a game's does. The state stays as it is. One command for each set of labels is enough; `stepper` as in the loop."""
-    # With a step length, and as a stuck character, a step has a term and a search of its own.
-    stuck = replace(state, settings=replace(state.settings, stuck=-1.0))
     for command in commands:
         (stepper or step)(state, command)
-        step(stuck, replace(command, step_length=command.step_length or STEP_LENGTHS[0] * state.character.scale))
+        step(state, replace(command, step_length=command.step_length or STEP_LENGTHS[0] * state.character.scale))
 
 
 def save(state: SteerState) -> bytes:
@@ -462,17 +434,13 @@ def condition_prior(prior: Density, labels: tuple[str, ...]) -> Density:
     return prior.conditioned_on(labels) if labels else prior
 
 
-def _solve_step(
-    state: SteerState, terms: Sequence[Term], seconds: float | None, *, free: bool
-) -> tuple[CommittedFrames, Outcome]:
+def _solve_step(state: SteerState, terms: Sequence[Term], seconds: float | None) -> tuple[CommittedFrames, Outcome]:
     settings = state.settings
-    method: SingleWindowSolver = _limit_evaluations(state, settings.evaluations, seconds)
+    planned_now = state.steps is not None and state.steps.taken == 0  # planning takes as long as a search
+    method: SingleWindowSolver = _limit_evaluations(state, 1 if planned_now else settings.evaluations, seconds)
     if state.steps is not None:
         method = GuidedNoiseSolver(state.steps.window(settings.horizon), 1.0, method.lbfgs, method.budget)
         state = replace(state, committed=replace(state.committed, warm_start=state.committed.warm_start[:0]))
-    elif free:
-        half = _limit_evaluations(state, settings.evaluations // 2, seconds and seconds / 2)
-        method = _relax_footing_first(half, settings.random_starts, terms, settings.footing)
     window = HorizonSettings(frames=settings.horizon, overlap=settings.horizon - settings.commit)
     solver = RecedingHorizonSolver(state.prior, window, state.character.unit_skeleton, method=method)
     frames = len(state.committed.features) + settings.commit
@@ -491,15 +459,16 @@ def _limit_evaluations(state: SteerState, evaluations: int, seconds: float | Non
 
 
 def _find_steps(state: SteerState, command: Command) -> PlannedSteps | None:
-    """Find the planned steps from which the search starts: those under way, or new ones where the command leads to no
-    walk, or to a stand."""
-    steps = state.steps
-    if steps is not None and steps.obey(command):
+    """Find the planned steps from which the search starts: those under way, or new ones where no walk leads to what is
+    commanded."""
+    steps, stands, heading = state.steps, _stands(state), float(state.committed.ground_pose.heading)
+    if steps is not None and steps.obey(command, heading):
         return steps
-    needed, stands = needs_steps(command, float(state.committed.ground_pose.heading)), _stands(state)
-    if not needed and (stands or command.speed > 0 or command.turning is not None):
+    starts = steps is not None or stands or _is_at_rest(state)
+    stops = command.speed == 0 and command.turning is None and not stands
+    if not stops and not needs_steps(command, heading, starts=starts):
         return None
-    if float(_recent_velocity(state, _REST_FRAMES).norm()) > _FASTEST_PLANNED:
+    if float(_recent_velocity(state).norm()) > _FASTEST_PLANNED:
         return None
     stand, limits = _find_mean_stand(state, command), state.settings.limits
     return plan_steps(_find_pose(state), state.committed.joints_world, stand, command, limits)
@@ -520,7 +489,7 @@ def _find_stand(state: SteerState, command: Command) -> Stand | None:
 def _is_at_rest(state: SteerState) -> bool:
     """Return whether the body hardly went in the last quarter of a second."""
     known = len(state.committed.joints_world) > _REST_FRAMES
-    return known and float(_recent_velocity(state, _REST_FRAMES).norm()) < state.settings.standing
+    return known and float(_recent_velocity(state).norm()) < state.settings.standing
 
 
 def _find_pose(state: SteerState) -> Motion:
@@ -565,44 +534,19 @@ def commit_frames(state: SteerState, new: Float[Tensor, "frames size"]) -> Commi
     ).discard_history(KEPT_FRAMES)
 
 
-def _velocity_error(state: SteerState) -> float:
-    """Compute the error of the mean velocity over the last half second, m/s."""
-    if min(len(state.committed.joints_world) - 1, len(state.past_targets)) < _RECENT_FRAMES:
-        return 0.0
-    return float((_recent_velocity(state) - state.past_targets[-_RECENT_FRAMES:].mean(0)).norm())
+def _plan_targets(state: SteerState, command: Command) -> list[SteeringTarget]:
+    settings = state.settings
+    return state.target.ahead(command, settings.limits, frames=settings.horizon, fps=PRIOR_FPS)
 
 
-def _plan_targets(state: SteerState, command: Command) -> tuple[list[SteeringTarget], bool]:
-    """Return the targets of a window, and whether a standing character is to go; it may turn faster."""
-    settings, target, leaving = state.settings, state.target, False
-    targets = target.ahead(command, settings.limits, frames=settings.horizon, fps=PRIOR_FPS)
-    if len(state.committed.joints_world) > _RECENT_FRAMES:
-        speed = float(_recent_velocity(state).norm())
-        leaving = speed < settings.standing and targets[-1].speed > speed + settings.stuck
-    if leaving and abs(math.remainder(command.heading - target.heading, 2 * math.pi)) > _FAR_TURN:
-        limits = replace(settings.limits, turn_rate=_LEAVING_TURN * settings.limits.turn_rate)
-        targets = target.ahead(command, limits, frames=settings.horizon, fps=PRIOR_FPS)
-    return targets, leaving
-
-
-def _recent_velocity(state: SteerState, frames: int = _RECENT_FRAMES) -> Float[Tensor, "2"]:
-    """Compute the mean velocity of the hips over the ground in the last frames, as many as there are, m/s."""
-    past = state.committed.joints_world[-frames - 1 :, 0, ::2]
+def _recent_velocity(state: SteerState) -> Float[Tensor, "2"]:
+    """Compute the mean velocity of the hips over the ground in the last quarter of a second, m/s."""
+    past = state.committed.joints_world[-_REST_FRAMES - 1 :, 0, ::2]
     return (past[-1] - past[0]) * PRIOR_FPS / max(1, len(past) - 1)
 
 
-def _restart_target(state: SteerState) -> SteerState:
-    """Restart the steering target from the character's velocity and facing, without past targets. A target far ahead of
-    a stuck character (a walk to its side while it stands) guides no search."""
-    velocity, facing = _recent_velocity(state), float(state.committed.ground_pose.heading)
-    speed = float(velocity.norm())
-    heading = math.atan2(*velocity.tolist()) if speed > _MIN_TRAVEL_SPEED else facing
-    target = SteeringTarget(speed, heading, facing)
-    return replace(state, target=target, past_targets=torch.tensor([target.velocity]).expand(_RECENT_FRAMES, 2))
-
-
 def _build_steering_terms(
-    state: SteerState, targets: Sequence[SteeringTarget], step_length: float | None, sigma_facing: float
+    state: SteerState, targets: Sequence[SteeringTarget], step_length: float | None
 ) -> Sequence[Term]:
     settings = state.settings
     velocity = RootVelocity(
@@ -611,7 +555,7 @@ def _build_steering_terms(
         facing=torch.tensor([target.facing for target in targets]),
         sigma_speed=settings.sigma_speed,
         sigma_direction=settings.sigma_direction,
-        sigma_facing=sigma_facing,
+        sigma_facing=settings.sigma_facing,
     )
     terms = velocity, settings.footing
     return (*terms, StepLength(step_length, sigma=settings.sigma_step)) if step_length else terms
@@ -622,28 +566,6 @@ def _draw_noise(state: SteerState) -> Float[Tensor, "frames continuous"]:
     frames, one = range(state.frames, state.frames + state.settings.horizon), torch.Generator()
     drawn = [torch.randn(LAYOUT.continuous, generator=one.manual_seed(state.seed + frame)) for frame in frames]
     return state.settings.liveliness * torch.stack(drawn)
-
-
-def _relax_footing_first(
-    half: LatentNoiseSolver, samples: int, terms: Sequence[Term], footing: FootContact
-) -> SingleWindowSolver:
-    """Build a window solver that spends half on all terms but contacts, from the best of some samples, and half on all
-    terms, each with half of the time. A standing character has both feet planted, by contacts that are fixed while a
-    window is solved: the contact term then prevents any step. The search without it finds one, along which the prior
-    predicts new contacts."""
-    space = SteeringKnots(_KNOTS, tuple(LAYOUT.slices)[:-1], _KNOT_SIGMA)
-    budget = replace(half.budget, evaluations=samples + (half.budget.evaluations or 1))
-    relaxed = replace(half, proposal=SwarmProposal(SwarmSettings(samples, iterations=1), space), budget=budget)
-    others = [term for term in terms if term.name != footing.name]
-
-    def solve(request: WindowRequest) -> SolvedWindow:
-        request = replace(request, seconds=request.seconds / 2)
-        first = relaxed(replace(request, terms=others))
-        second = half(replace(request, warm_start=first.warm_start))
-        spent = first.record.evaluations + second.record.evaluations
-        return replace(second, record=replace(second.record, evaluations=spent))
-
-    return solve
 
 
 def _expect(known: float, last: float) -> float:

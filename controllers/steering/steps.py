@@ -40,13 +40,18 @@ _SAME_SPEED, _SAME_ANGLE = 0.1, math.radians(10)  # m/s and radians by which a c
 _ROOT = slice(0, LAYOUT.slices["root_height"].start)  # what travels
 
 
-def needs_steps(command: Command, heading: float) -> bool:
-    """Return whether a body with a heading, radians, obeys a command by planned steps; at rest, if it is to stand."""
+def needs_steps(command: Command, heading: float, *, starts: bool = False) -> bool:
+    """Return whether a body with a heading, radians, obeys a command by planned steps: where it is to turn on the spot,
+    to travel off its facing, or to start to walk off its heading."""
     if command.turning is not None:
         return False
     if command.speed == 0:
         return abs(_wrap(command.hips_heading - heading)) > _TURNED
-    return abs(_wrap(command.heading - command.hips_heading)) > _OFF_FACING
+    return not _is_walk(command) or (starts and abs(_wrap(command.heading - heading)) > _OFF_FACING)
+
+
+def _is_walk(command: Command) -> bool:
+    return command.speed > 0 and abs(_wrap(command.heading - command.hips_heading)) <= _OFF_FACING
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +74,10 @@ class PlannedSteps:
         """Whether its last frame, a stand, is delivered."""
         return not self.cycle and self.taken >= len(self.features)
 
-    def obey(self, command: Command) -> bool:
-        """Return whether they are under way and obey a command."""
+    def obey(self, command: Command, heading: float) -> bool:
+        """Return whether they are under way and obey a command; a walk, until the body's heading, radians, is its."""
+        if _is_walk(command) and abs(_wrap(command.heading - heading)) < _SAME_ANGLE:
+            return False
         turned = command.heading - self.command.heading, command.hips_heading - self.command.hips_heading
         near = abs(command.speed - self.command.speed) < _SAME_SPEED and (command.speed > 0) == (self.command.speed > 0)
         return not self.ended and near and all(abs(_wrap(angle)) < _SAME_ANGLE for angle in turned)
@@ -171,8 +178,8 @@ def plan_steps(
         body.local_quat_xyzw[:, arm] = rotations.multiply(swung, body.local_quat_xyzw[:, arm])
     features = encode(stand_on(body, torch.stack(toes, dim=1), torch.stack(turns, dim=1)))[0][1:].float()
     cycle = 2 * period if command.speed > 0 else 0
-    frames = max(settled, _POSED) + 2 * cycle if cycle else max(step.land for step in taken) + 2
-    return PlannedSteps(command, features[:frames].clone(), targets[:frames], cycle)
+    frames = max(settled, _POSED) + 3 * period if cycle else max(step.land for step in taken) + 2
+    return PlannedSteps(command, features[:frames].clone(), targets, cycle)
 
 
 def _lay_track(
@@ -187,7 +194,7 @@ def _lay_track(
     change = max(1, math.ceil(float((wanted - velocity).norm()) / rate * PRIOR_FPS))
     turned = _EASE + math.ceil(abs(turn) / limits.turn_rate * PRIOR_FPS)
     settled = max(change, turned)
-    clock = torch.arange(max(settled, _POSED) + 8 * (SWING + BOTH), dtype=torch.float64)
+    clock = torch.arange(max(settled, _POSED) + 6 * (SWING + BOTH), dtype=torch.float64)
     travel = torch.lerp(velocity, wanted, (clock / change).clamp(max=1)[:, None])
     path = pose.root_position[0, ::2] + (travel.cumsum(dim=0) - travel[0]) / PRIOR_FPS
     rates = torch.minimum(clock, turned - clock).clamp(0, _EASE)
@@ -195,7 +202,7 @@ def _lay_track(
     direction = torch.where(travel.norm(dim=-1) > 0, torch.atan2(travel[:, 0], travel[:, 1]), facing)
     rows = torch.stack([travel.norm(dim=-1), direction, facing], dim=1)[1:].tolist()
     move = Displacement(stand, stand, torch.cat([path, facing[:, None]], dim=1))
-    return move, [SteeringTarget(*row) for row in rows], settled
+    return move, [SteeringTarget(*row) for row in rows[:settled]], settled
 
 
 def _wrap(angle: float) -> float:

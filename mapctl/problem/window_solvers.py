@@ -1,8 +1,8 @@
 """Solvers of one window: a start, a parametrisation of its frames, and L-BFGS over the unknowns.
 
 The search over a rollout's noise starts at the last window's noise, or at the best of a particle swarm over a few
-numbers that steer: noise at a few knots in time, linear in between. All the noise of a window (34 x 66 numbers) is too
-many dimensions for a swarm.
+numbers that steer: noise at a few knots in time, linear in between. All the noise of a window, 66 numbers a frame, is
+too many dimensions for a swarm.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,41 +33,27 @@ WarmStartProposal = Callable[[WindowRequest, Float[Tensor, "1 unknowns"], Meter]
 """(request, warm start over the whole window, meter) to the unknowns from which L-BFGS starts."""
 
 
-@dataclass(frozen=True)
-class SteeringKnots:
-    """A space of few dimensions in the noise of a window: some blocks of features at knots in time."""
-
-    knots: int = 4
-    """Number of knots, evenly spaced over the window; between them the noise is linear."""
-    blocks: tuple[str, ...] = ("root_displacement_heading", "heading_change")
-    """Feature blocks whose noise is searched."""
-    spread: float = 0.7
-    """Standard deviation of draws at each knot, in units of the noise, whose own is 1."""
-
-    def size(self) -> int:
-        """Return the number of dimensions."""
-        return self.knots * len(self._columns())
-
-    def expand(self, values: Float[Tensor, "batch size"], frames: int) -> Float[Tensor, "batch frames continuous"]:
-        """Return the noise of whole windows at points of the space."""
-        knots = torch.unflatten(values, -1, (self.knots, -1)).transpose(1, 2)
-        dense = torch.nn.functional.interpolate(knots, size=frames, mode="linear", align_corners=True)
-        noise = values.new_zeros(len(values), frames, LAYOUT.continuous)
-        noise[..., self._columns()] = dense.transpose(1, 2)
-        return noise
-
-    def _columns(self) -> list[int]:
-        return [i for block in self.blocks for i in range(LAYOUT.slices[block].start, LAYOUT.slices[block].stop)]
+_STEERING = [
+    column
+    for block in ("root_displacement_heading", "heading_change")
+    for column in range(LAYOUT.slices[block].start, LAYOUT.slices[block].stop)
+]
+"""Columns of the noise that the swarm searches."""
 
 
 @dataclass(frozen=True)
 class SwarmProposal:
-    """A particle swarm (Wang et al. 2019, section 5.2) in the steering space, started at the warm start."""
+    """A particle swarm (Wang et al. 2019, section 5.2) over noise of travel and turning, added to the warm start.
+
+    The unknowns are its values at knots, evenly spaced over the window; between them it is linear.
+    """
 
     settings: SwarmSettings = field(default_factory=SwarmSettings)
     """Number of particles and iterations; with one iteration the best of random draws."""
-    space: SteeringKnots = SteeringKnots()
-    """Space in which they move."""
+    knots: int = 4
+    """Number of knots."""
+    spread: float = 0.7
+    """Standard deviation of draws at each knot, in units of the noise, whose own is 1."""
 
     def __call__(
         self, request: WindowRequest, warm: Float[Tensor, "1 unknowns"], meter: Meter
@@ -75,16 +61,20 @@ class SwarmProposal:
         """Return the best point of the swarm, each under its own plan; the meter counts what was evaluated."""
 
         def unknowns(points: Float[Tensor, "batch size"]) -> Float[Tensor, "batch unknowns"]:
-            return warm + self.space.expand(points.to(warm.dtype), request.context.frames).flatten(1)
+            at_knots = torch.unflatten(points.to(warm.dtype), -1, (self.knots, -1)).transpose(1, 2)
+            noise = warm.new_zeros(len(points), request.context.frames, LAYOUT.continuous)
+            dense = torch.nn.functional.interpolate(at_knots, size=noise.shape[1], mode="linear", align_corners=True)
+            noise[..., _STEERING] = dense.transpose(1, 2)
+            return warm + noise.flatten(1)
 
         def energy(points: Float[Tensor, "batch size"]) -> Float[Tensor, " batch"]:
             noise = unknowns(points)
             with torch.no_grad():
                 return Objective(LatentNoise.from_unknowns(request.context, noise).build, request.terms).energy(noise)
 
-        start, spread = torch.zeros(self.space.size()), self.space.spread
+        start = torch.zeros(self.knots * len(_STEERING))
         found = run_swarm(
-            energy, start=start, spread=spread, settings=self.settings, meter=meter, generator=request.generator
+            energy, start=start, spread=self.spread, settings=self.settings, meter=meter, generator=request.generator
         )
         return unknowns(found.x[None])
 

@@ -736,7 +736,9 @@ class FastWindow(PreparedRollout):
         slot, batch = noise.shape[1] % len(self._tape.frame), self._batch
         memory = (self._tape.lstm_input[slot, :, :batch, self._hidden], self._tape.cell[slot, :, :batch, : self._width])
         features = torch.from_numpy(self._features[:batch]).to(self._kind)
-        return features, LstmState(features[:, -1], *(torch.from_numpy(part.copy()).to(self._kind) for part in memory))
+        return features, LstmState(
+            features[:, -1].clone(), *(torch.from_numpy(part.copy()).to(self._kind) for part in memory)
+        )
 
     def roll_out(
         self, noise: Float[Tensor, "batch frames continuous"]

@@ -306,7 +306,7 @@ class LstmGmm(nn.Module):
     ) -> LstmState:
         """Return the state after the committed frames, without gradient; `condition` is as in `forward`."""
         with torch.no_grad():
-            return LstmState(committed[:, -1], *self._predict(state, committed, condition)[1])
+            return LstmState(committed[:, -1].clone(), *self._predict(state, committed, condition)[1])
 
     def sample(
         self,

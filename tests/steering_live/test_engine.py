@@ -94,6 +94,7 @@ def test_a_forked_pool_steps_after_its_parent_has_solved():
 
 _WARM = """
 import gc
+import math
 from numba.core.dispatcher import Dispatcher
 from dataclasses import replace
 from tiny_steering import AHEAD, begun
@@ -106,9 +107,9 @@ state, _ = begun()
 cold = compiled()
 steer.warm_up(state, [AHEAD])
 warm = compiled()
-for command in (AHEAD, replace(AHEAD, step_length=0.5), replace(AHEAD, reach={"leftHand": (0.4, 1.2, 0.6)})):
-    for start in (state, replace(state, settings=replace(state.settings, stuck=-1.0))):
-        steer.step(start, command)
+backward = replace(AHEAD, heading=math.pi, facing=0.0)
+for command in (AHEAD, backward, replace(AHEAD, step_length=0.5), replace(AHEAD, reach={"leftHand": (0.4, 1.2, 0.6)})):
+    steer.step(state, command)
 print(warm - cold, compiled() - warm)
 """
 

@@ -72,15 +72,6 @@ def test_without_time_it_still_delivers_with_a_note(least):
     assert bool(torch.isfinite(piece.motion.local_quat_xyzw).all())
 
 
-def test_a_stuck_search_is_repeated_without_footing_first():
-    """Both searches count, and together with the draws they are no more than were allowed."""
-    state, _ = steered(8)
-    stuck = replace(state, settings=replace(QUICK, stuck=-1.0, random_starts=5))
-    (_, plain), (_, freed) = steer.step(state, AHEAD), steer.step(stuck, AHEAD)
-    assert 5 < freed.evaluations <= 4 + 5
-    assert not torch.equal(plain.motion.local_quat_xyzw, freed.motion.local_quat_xyzw)
-
-
 def test_motion_that_is_not_finite_is_replaced_by_the_priors_own():
     state, _ = steered(2)
     broken = replace(state, committed=replace(state.committed, warm_start=state.committed.warm_start * math.nan))

@@ -146,7 +146,7 @@ def test_travel_is_no_faster_than_feet_can_step(stand):
     steps = plan_steps(stand, walk_before(stand, 0.0), stand, command, SteeringLimits())
     assert steps is not None
     assert 1.0 < steps.targets[-1].speed < 2.0
-    assert steps.obey(command)
+    assert steps.obey(command, AHEAD)
     toes = play(steps.window(120)).joint_positions()[:, CANONICAL.indices(TOES)]
     assert float((toes[:, 0] - toes[:, 1]).norm(dim=-1).max()) < 0.85
     assert float(torch.diff(toes[:, :, ::2], dim=0).norm(dim=-1).max()) * PRIOR_FPS < 8
@@ -174,6 +174,16 @@ def test_what_is_no_walk_needs_steps(command, wanted):
     assert needs_steps(command, 0.0) == wanted
 
 
+@pytest.mark.parametrize(("heading", "wanted"), [(0.3, False), (1.0, True), (math.pi, True), (2 * math.pi, False)])
+def test_a_walk_starts_by_steps_until_the_body_is_headed_for_it(heading, wanted):
+    walk = Command(1.0, heading)
+    assert needs_steps(walk, 0.0, starts=True) == wanted
+    assert not needs_steps(walk, 0.0)
+    planned = PlannedSteps(walk, torch.zeros(3, 68), [])
+    assert planned.obey(walk, heading + 0.3)
+    assert not planned.obey(walk, heading + 0.1)
+
+
 @pytest.mark.parametrize(
     ("command", "obeyed"),
     [
@@ -187,9 +197,9 @@ def test_what_is_no_walk_needs_steps(command, wanted):
 )
 def test_steps_obey_commands_like_their_own(command, obeyed):
     planned = PlannedSteps(Command(0.6, 1.5, 0.0), torch.zeros(3, 68), [])
-    assert planned.obey(command) == obeyed
-    assert not planned.after(3).obey(command)
-    assert replace(planned, cycle=2).after(3).obey(command) == obeyed
+    assert planned.obey(command, 0.0) == obeyed
+    assert not planned.after(3).obey(command, 0.0)
+    assert replace(planned, cycle=2).after(3).obey(command, 0.0) == obeyed
 
 
 def test_a_stand_sways_without_creeping_trembling_or_repeating(stand):
