@@ -77,6 +77,7 @@ _JUDGED_FRAMES = 60  # that are kept for terms that look back
 _PAST_TARGET_FRAMES = 60  # past targets that are kept: more than the root velocity term looks back on
 _REST_FRAMES = 8  # over which a body at rest hardly goes
 _WIDER = 2.0  # times that the prior is along planned steps, which it takes for less likely than they are
+_ALONG_STEPS = 2  # evaluations along planned steps, which obey the command already
 _ENOUGH = 1e-2  # share of the energy: a search ends where an iteration wins less
 _FASTEST_PLANNED = 1.5  # m/s beyond which a body slows down before its steps are planned
 _NEAREST_STARTS = 6  # initial states nearest to the requested speed, of which one is sampled
@@ -337,8 +338,9 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
         restarted = replace(conditioned, committed=cold, steps=None)
         done, _ = _solve_step(restarted, terms, 0.0)  # the prior's own continuation, which always exists
     new, record = done.features[-settings.commit :], done.windows[-1]
-    cut_short = record.outcome == LbfgsStatus.OUT_OF_BUDGET.value and record.evaluations < settings.evaluations
-    note = f"the deadline came after {record.evaluations} of {settings.evaluations} evaluations"
+    most = _most_evaluations(state)
+    cut_short = record.outcome == LbfgsStatus.OUT_OF_BUDGET.value and record.evaluations < most
+    note = f"the deadline came after {record.evaluations} of {most} evaluations"
     status = Status(Outcome.BUDGET, (note,)) if cut_short else Status(Outcome.DONE)
     committed = done.discard_history(max(len(new), KEPT_FRAMES))
     after, frames = deliver(state, committed, new, targets[: settings.commit], asked, done.ahead, done.forecast)
@@ -435,11 +437,13 @@ def condition_prior(prior: Density, labels: tuple[str, ...]) -> Density:
 
 
 def _solve_step(state: SteerState, terms: Sequence[Term], seconds: float | None) -> tuple[CommittedFrames, Outcome]:
-    settings = state.settings
-    planned_now = state.steps is not None and state.steps.taken == 0  # planning takes as long as a search
-    method: SingleWindowSolver = _limit_evaluations(state, 1 if planned_now else settings.evaluations, seconds)
-    if state.steps is not None:
-        method = GuidedNoiseSolver(state.steps.window(settings.horizon), 1.0, method.lbfgs, method.budget)
+    settings, steps, most = state.settings, state.steps, max(1, _most_evaluations(state))
+    lbfgs = LbfgsSettings(max_iterations=most, relative_energy_tolerance=_ENOUGH)
+    budget = Budget(most, seconds, evaluation_seconds=state.cost.evaluation)  # begins none that it cannot end
+    if steps is None:
+        method: SingleWindowSolver = LatentNoiseSolver(rounds=1, lbfgs=lbfgs, budget=budget)
+    else:
+        method = GuidedNoiseSolver(steps.window(settings.horizon), 1.0, lbfgs, budget)
         state = replace(state, committed=replace(state.committed, warm_start=state.committed.warm_start[:0]))
     window = HorizonSettings(frames=settings.horizon, overlap=settings.horizon - settings.commit)
     solver = RecedingHorizonSolver(state.prior, window, state.character.unit_skeleton, method=method)
@@ -449,13 +453,9 @@ def _solve_step(state: SteerState, terms: Sequence[Term], seconds: float | None)
     )
 
 
-def _limit_evaluations(state: SteerState, evaluations: int, seconds: float | None) -> LatentNoiseSolver:
-    """Build a solver of one round within these evaluations and seconds, which begins none that it cannot end."""
-    most = max(1, evaluations)
-    budget = Budget(most, seconds, evaluation_seconds=state.cost.evaluation)
-    return LatentNoiseSolver(
-        rounds=1, lbfgs=LbfgsSettings(max_iterations=most, relative_energy_tolerance=_ENOUGH), budget=budget
-    )
+def _most_evaluations(state: SteerState) -> int:
+    most = state.settings.evaluations
+    return most if state.steps is None else min(most, _ALONG_STEPS)
 
 
 def _find_steps(state: SteerState, command: Command) -> PlannedSteps | None:

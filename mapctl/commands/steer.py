@@ -53,7 +53,7 @@ class Steer(ModelCommand, options.ReadOptions, streaming.StreamOptions):
     commands: Positional[Annotated[Path, arg(metavar="COMMANDS.csv")]]
     """CSV with the columns time_s, speed_mps, heading_deg (0 is +Z, 90 is +X); and, where wanted, facing_deg for
     strafing, turn_deg_s to turn continuously, step_m for a step length, gait and style of the prior,
-    left_hand_x, left_hand_y, left_hand_z (and right_hand_, look_) for a place in metres that a hand reaches or that is
+    left_hand_x, left_hand_y, left_hand_z (and right_hand_, look_) for a point in metres that a hand reaches or that is
     looked at. goto_x_m, goto_z_m, within_s, and where wanted goto_facing_deg and pose (FILE:FRAME), give where the hips
     are to be first, and within how many seconds: the rest of the line holds from then on. The last line's time is the
     end, or a second after the last position is reached."""
