@@ -190,9 +190,9 @@ def plan_footsteps(displacement: Displacement, frames: int) -> list[Footstep]:
     if displacement.distance < _MOVED and displacement.turn < _TURNED:
         return []
     count = max(displacement.count_steps(), frames // _SLOWEST)
-    plans = [_lay_steps([(first + number) % 2 for number in range(count)], frames) for first in range(2)]
+    plans = [_lay_steps(first, count, frames) for first in range(2)]
     if displacement.leads_aside:
-        plans += [_lay_side_steps(displacement, first, frames) for first in range(2)]
+        plans += [_lay_steps(first, 2 * (count - 1), frames, pairs=True) for first in range(2)]
     plan = min(plans, key=lambda plan: measure_strain(displacement, plan))
     shares = torch.tensor([step.share for step in plan], dtype=torch.float64)
     toes = [displacement.toes_at(foot, shares)[0][:, ::2].tolist() for foot in range(2)]
@@ -214,28 +214,14 @@ def _share_of(number: int, count: int) -> float:
     return min(1.0, (number + 1) / max(1, count - 1))
 
 
-def _lay_steps(feet: Sequence[int], frames: int) -> list[Footstep]:
-    count = len(feet)
+def _lay_steps(first: int, count: int, frames: int, *, pairs: bool = False) -> list[Footstep]:
+    """Lay alternating steps; in pairs, the second foot of each comes beside the first."""
     swing = (frames - 1) / (count + (count + 1) * BOTH / SWING)
     both, plan = swing * BOTH / SWING, list[Footstep]()
-    for number, foot in enumerate(feet):
+    for number in range(count):
         lift = both + number * (swing + both)
-        plan.append(Footstep(foot, round(lift), round(lift + swing), _share_of(number, count)))
-    return plan
-
-
-_ASIDE, _PAIR = 0.5, 30  # of legs' length that a foot steps aside at most, and frames of the steps of both feet
-
-
-def _lay_side_steps(displacement: Displacement, first: int, frames: int) -> list[Footstep]:
-    """Lay steps by which a foot goes ahead, and the other one comes beside it."""
-    length = _ASIDE * leg_length(displacement.start.skeleton)
-    pairs = max(1, math.ceil(displacement.distance / length - 1e-6), round(frames / _PAIR))
-    each, plan = (frames - 1) / pairs, list[Footstep]()
-    for pair in range(pairs):
-        for half, foot in enumerate((first, 1 - first)):
-            lift, land = (round((pair + part + 0.49 * half) * each) for part in (0.04, 0.47))
-            plan.append(Footstep(foot, lift, land, (pair + 1) / pairs))
+        share = (number // 2 + 1) / (count // 2) if pairs else _share_of(number, count)
+        plan.append(Footstep((first + number) % 2, round(lift), round(lift + swing), share))
     return plan
 
 
