@@ -122,8 +122,8 @@ def recorded(page, tmp_path, seconds: float) -> mapctl.Motion:
 
 
 @pytest.mark.slow
-def test_a_walk_through_the_page(prior, tmp_path):
-    show = Live("--prior", prior)
+def test_a_walk_through_the_page(tmp_path):
+    show = Live()
     with open_page(show.url) as page:
         open_tab(page, "Steer")
         number(page, "Speed, m/s").click()
@@ -172,7 +172,7 @@ def test_a_phone_steers_by_touch(prior):
         page.mouse.move(x + 50, y)
         page.get_by_text("mapctl live").last.evaluate("one => one.click()")
         speed.wait_for(timeout=20_000)
-        assert shows(page, "Speed, m/s", lambda value: value > 2)
+        assert shows(page, "Speed, m/s", lambda value: value > 1.3), "faster than a walk"
         assert shows(page, "Heading, degrees", bool)
         page.mouse.up()
         assert shows(page, "Speed, m/s", lambda value: value == 0)
