@@ -73,18 +73,23 @@ class Live:
 
 
 @contextmanager
-def open_page(url: str, **device: Any) -> Iterator[Any]:
+def open_page(show: Live, **device: Any) -> Iterator[Any]:
     """The page in a browser that draws without a graphics card, once its characters move; no script of it may fail."""
     from playwright.sync_api import sync_playwright
 
-    with sync_playwright() as drivers:
-        browser = drivers.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
-        page, faults = browser.new_page(**{"viewport": SIZE, "accept_downloads": True} | device), []
-        page.on("pageerror", lambda error: faults.append(str(error)))
-        page.goto(url)
-        page.get_by_text(COUNTED).wait_for(timeout=60_000, state="attached")  # a phone's panel is folded
-        yield page
-        browser.close()
+    faults = []
+    try:
+        with sync_playwright() as drivers:
+            browser = drivers.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
+            page = browser.new_page(**{"viewport": SIZE, "accept_downloads": True} | device)
+            page.on("pageerror", lambda error: faults.append(str(error)))
+            page.goto(show.url)
+            page.get_by_text(COUNTED).wait_for(timeout=60_000, state="attached")  # a phone's panel is folded
+            yield page
+            browser.close()
+    except BaseException:
+        show.end()  # else its characters go on
+        raise
     assert faults == []
 
 
@@ -124,7 +129,7 @@ def recorded(page, tmp_path, seconds: float) -> mapctl.Motion:
 @pytest.mark.slow
 def test_a_walk_through_the_page(tmp_path):
     show = Live()
-    with open_page(show.url) as page:
+    with open_page(show) as page:
         open_tab(page, "Steer")
         number(page, "Speed, m/s").click()
         page.keyboard.press("Control+a")
@@ -158,7 +163,7 @@ def test_a_walk_through_the_page(tmp_path):
 @pytest.mark.slow
 def test_a_phone_steers_by_touch(prior):
     show = Live("--prior", prior)
-    with open_page(show.url, viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True) as page:
+    with open_page(show, viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True) as page:
         speed = page.get_by_text("Speed, m/s", exact=True)
         speed.wait_for(state="hidden", timeout=20_000)
         inside = "() => [...document.querySelectorAll('#mapctl-touch > *')].every((one) => {"
