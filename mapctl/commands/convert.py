@@ -13,6 +13,7 @@ from mapctl.commands.shared import folders, inputs, options, outputs
 from mapctl.commands.shared.command import Command
 from mapctl.editing.rigged_motion import RiggedMotion
 from mapctl.errors import RequestError
+from mapctl.formats import smpl
 from mapctl.metrics import feet
 from mapctl.motion import Motion
 from mapctl.retarget import as_rig, identify_rig
@@ -29,10 +30,10 @@ class Convert(Command, options.ReadOptions):
     """
 
     source: Positional[Annotated[Path, arg(metavar="IN|FOLDER")]]
-    """.bvh, .npz, or .amc: its skeleton is the .asf of the same name, else the only one in the folder, else
-    named as in subject.asf+take.amc. Of a character (.glb, .gltf, .vrm, .vrma, .usda, .usdc, .usd, .usdz, .fbx) its
-    first animation, else one frame of its rest pose; hero.glb#ARMATURE, hero.glb#ARMATURE/ANIMATION and
-    hero.glb#/ANIMATION choose others. Or a folder, every motion below it."""
+    """.bvh, .npz (mapctl's, or SMPL parameters as in AMASS), or .amc: its skeleton is the .asf of the same name,
+    else the only one in the folder, else named as in subject.asf+take.amc. Of a character (.glb, .gltf, .vrm, .vrma,
+    .usda, .usdc, .usd, .usdz, .fbx) its first animation, else one frame of its rest pose; hero.glb#ARMATURE,
+    hero.glb#ARMATURE/ANIMATION and hero.glb#/ANIMATION choose others. Or a folder, every motion below it."""
     out: Positional[Annotated[Path, arg(metavar="OUT|FOLDER")]]
     """.bvh, .npz, or with a skinned body .glb, .usda, .usdc or .usd: that of the character in IN or in --rig, where it
     came from such a file, else a mannequin. A .vrm is written of a VRM character only. A .vrma holds motion
@@ -44,6 +45,11 @@ class Convert(Command, options.ReadOptions):
     """`canonical`: canonical joints with the performer's own bones; or a clip whose skeleton is wanted, on which the
     character has its floor and planted feet, in the clip's layout; or a rig by name or TOML file, whose joints
     get the bones of the canonical body."""
+    as_: Annotated[Literal["smpl"] | None, arg(name="as")] = None
+    """`smpl`: write SMPL parameters in the layout of AMASS, as .npz: poses, trans and mocap_framerate, Z up."""
+    smpl_model: options.MaybeFile = None
+    """Body model for SMPL parameters in IN, an .npz of your own with v_template, shapedirs and J_regressor: bones and
+    floor are those of the file's betas. Without it the bones are those of the canonical body."""
     ground: Literal["fit", "keep"] = "fit"
     """Supports such as stairs and platforms, on the skeleton of another rig: `fit` scales their height with the
     legs, `keep` keeps it in metres."""
@@ -108,8 +114,14 @@ class Conversion:
         """Parse the options; RequestError for those that are none or do not go together."""
         if command.in_place and command.root_motion:
             raise RequestError("--in-place takes the travel out and --root-motion puts it on the root; choose one")
+        if command.as_ is not None and (
+            command.rig is not None or (command.to or command.out.suffix) not in (".npz", "npz")
+        ):
+            raise RequestError("--as smpl is a body of its own in an .npz; leave --rig out, and name an .npz")
         fps, fps_in = (None if text is None else parse_fps(text) for text in (command.fps, command.fps_in))
         body = None if command.rig in (None, "canonical") else inputs.read_rigged(command.rig)
+        if command.as_ is not None:
+            body = RiggedCharacter.of(smpl.make_rest(smpl.build_skeleton(smpl.JOINTS[0])), None)[1]
         return Conversion(command, fps, fps_in, inputs.read_rig(command.source_rig, command), body)
 
     def convert(self, source: Path) -> Converted:
@@ -117,6 +129,8 @@ class Conversion:
         # Of other files than .amc the rate is in the file.
         fps_in = self.fps_in if source.suffix.lower() == ".amc" or not command.source.is_dir() else None
         motion = inputs.read_motion(source, rig, fps=fps_in, quiet=command.quiet)
+        if command.smpl_model is not None:
+            motion = smpl.fit_bones(motion, command.smpl_model)
         edited = command.mirror or command.loop or command.plant_feet or command.in_place or command.root_motion
         if edited and command.rig is None:  # before frames are cut, since the whole clip shows the rig
             rig = as_rig(identify_rig(motion.skeleton, rig, motion=motion))
@@ -126,6 +140,8 @@ class Conversion:
         changes, cycle, lines = None, None, list[str]()
         if command.rig == "canonical":
             motion, rig = retarget.to_canonical(motion, self.source_rig)[0], retarget.load_rig("canonical")
+        elif command.as_ is not None and (ordered := smpl.order_joints(motion)) is not None:
+            motion = ordered
         elif self.body is not None:
             found = retarget_motion(motion, self.body, self.source_rig, ground=command.ground)
             original = motion if motion.skeleton.matches(self.body.rigmap.rig_skeleton) else None
@@ -154,11 +170,15 @@ class Conversion:
             motion = retarget.to_canonical(motion, rig or self.source_rig)[0]
         return Converted(motion, tuple(lines), changes, tuple(notes))
 
+    def save(self, motion: Motion, out: Path) -> None:
+        """Write a converted motion."""
+        (formats if self.command.as_ is None else smpl).save(motion, out)
+
     def __call__(self, source: Path, out: Path) -> tuple[int, float]:
         """Convert one file of a folder and write the result; return its frames and the seconds that it took."""
         start = perf_counter()
         motion = self.convert(source).motion
-        formats.save(motion, out)
+        self.save(motion, out)
         return motion.num_frames, perf_counter() - start
 
 
@@ -204,8 +224,9 @@ def run(command: Convert) -> int:
             raise RequestError(f"--{name} is for folders; {command.source} is a file")
     formats.check_ending(command.out)
     outputs.check_files([command.out, *options.collect_paths(command.report)])
-    done = Conversion.of(command).convert(command.source)
-    formats.save(done.motion, command.out)
+    conversion = Conversion.of(command)
+    done = conversion.convert(command.source)
+    conversion.save(done.motion, command.out)
     if command.report is not None and done.changes is not None:
         request = options.describe_request("convert", command)
         changes = asdict(done.changes) | {"notes": list(done.notes)}

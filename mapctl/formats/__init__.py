@@ -141,7 +141,9 @@ def _find_reader(path: str | PathLike[str]) -> ModuleType:
     ending = ending_of(path)
     if ending not in READERS:
         asf = "is a skeleton alone: name its motion, a .amc beside it or subject.asf+take.amc"
-        why = asf if ending == ".asf" else f"cannot read the ending {ending!r}"
+        pickled = "is a pickle, whose reading runs code: save its poses, trans and mocap_framerate as an .npz"
+        known = {".asf": asf, **dict.fromkeys((".pkl", ".pt", ".pth"), pickled)}
+        why = known.get(ending, f"cannot read the ending {ending!r}")
         raise FileFormatError(path, f"{why}; allowed: {', '.join(READERS)}")
     try:
         return import_module(f"mapctl.formats.{READERS[ending]}")

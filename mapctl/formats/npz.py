@@ -15,8 +15,11 @@ What another format needs to write a file back as it came (`Motion.source`) is n
 """
 
 import io
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from fractions import Fraction
 from os import PathLike
+from typing import Any
 
 import numpy as np
 import torch
@@ -57,9 +60,15 @@ _TRACKS = ("root_position_world", "local_quat_xyzw", "moving_offsets")
 
 
 def read(path: str | PathLike[str], *, lossy: bool) -> tuple[Motion, MissingValues]:
-    """Read what `save` wrote. FileFormatError names the key that is missing or wrong. Some rotations and positions of a
-    `lossy` archive may be NaN."""
-    arrays = _read_arrays(path, read_bytes(path))
+    """Read what `save` wrote, or SMPL parameters (`mapctl.formats.smpl`). FileFormatError names the key that is missing
+    or wrong. Some rotations and positions of a `lossy` archive may be NaN."""
+    raw = read_bytes(path)
+    if "poses" in _list_keys(path, raw):
+        from mapctl.formats import smpl  # which reads arrays by this module
+
+        motion = smpl.read(path, read_arrays(path, raw, smpl.NEEDED, smpl.OPTIONAL))
+        return motion, MissingValues.none(motion.num_frames, motion.num_joints)
+    arrays = read_arrays(path, raw, tuple(_KEYS), (_LICENCE,))
     _check_shapes(path, arrays, lossy=lossy)
     lost = _replace_missing(path, arrays)
     if (found := str(arrays["format"])) != FORMAT:
@@ -119,18 +128,31 @@ def _build_motion(arrays: dict[str, np.ndarray]) -> Motion:
     )
 
 
-def _read_arrays(path: str | PathLike[str], raw: bytes) -> dict[str, np.ndarray]:
-    """Read the known keys. Sizes are bounded before anything is unpacked, and pickled objects are refused."""
+def read_arrays(
+    path: str | PathLike[str], raw: bytes, needed: Sequence[str], optional: Sequence[str] = ()
+) -> dict[str, np.ndarray]:
+    """Read arrays of an archive. Sizes are bounded before anything is unpacked, and pickled objects are refused."""
+    with _open_archive(path, raw) as archive:
+        if lacking := [key for key in needed if key not in archive]:
+            raise FileFormatError(path, f"lacks the keys {', '.join(lacking)}")
+        keys = [key for key in (*needed, *optional) if key in archive]
+        if (total := sum(archive.zip.getinfo(f"{key}.npy").file_size for key in keys)) > MAX_FILE_BYTES:
+            raise FileFormatError(path, f"unpacks to {total >> 20} MiB, allowed are {MAX_FILE_BYTES >> 20}")
+        return {key: archive[key] for key in keys}
+
+
+def _list_keys(path: str | PathLike[str], raw: bytes) -> list[str]:
+    with _open_archive(path, raw) as archive:
+        return list(archive.files)
+
+
+@contextmanager
+def _open_archive(path: str | PathLike[str], raw: bytes) -> Iterator[Any]:
     if not raw.startswith(b"PK\x03\x04"):
         raise FileFormatError(path, "is not an .npz archive")
     try:
         with np.load(io.BytesIO(raw), allow_pickle=False) as archive:
-            if lacking := [key for key in _KEYS if key not in archive]:
-                raise FileFormatError(path, f"lacks the keys {', '.join(lacking)}")
-            keys = [key for key in (*_KEYS, _LICENCE) if key in archive]
-            if (total := sum(archive.zip.getinfo(f"{key}.npy").file_size for key in keys)) > MAX_FILE_BYTES:
-                raise FileFormatError(path, f"unpacks to {total >> 20} MiB, allowed are {MAX_FILE_BYTES >> 20}")
-            return {key: archive[key] for key in keys}
+            yield archive
     except FileFormatError:
         raise
     except Exception as error:  # zipfile and numpy raise whatever a forged archive leads their parsers to
