@@ -72,7 +72,7 @@ COMMANDS = {
     "steer": "steer steering.csv -o steered.bvh --prior tiny.safetensors --report steered.json",
     "denoise": "denoise noisy.bvh -o clean.bvh --denoiser denoiser.safetensors --report clean.json",
     "denoise with a prior": "denoise noisy.bvh -o clean-2.bvh --denoiser denoiser.safetensors --prior tiny.safetensors"
-    " --mask mask.csv --anchor",
+    " --mask mask.csv --capture video",
     "denoise causal": "denoise noisy.bvh -o causal.bvh --denoiser denoiser.safetensors --causal",
     "infill": "infill walk.bvh -o filled.bvh --gap 10:22 --inbetweener infiller.safetensors --report filled.json",
     "infill joints": "infill walk.bvh -o arm.bvh --gap 5:25 --joints leftLowerArm,leftHand"

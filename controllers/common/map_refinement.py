@@ -19,7 +19,6 @@ from mapctl.contacts import compute_rest_log_probability, debounced, fit_support
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose
 from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.motion import Motion
-from mapctl.numerics import gaussian
 from mapctl.numerics.intervals import last_observed, next_observed
 from mapctl.pose import BodyPose, decode
 from mapctl.problem import density_selection
@@ -36,7 +35,6 @@ from mapctl.solver.budget import Budget
 from mapctl.solver.lbfgs import LbfgsSettings
 from mapctl.terms import Clearance, FootContact, Jerk, Keyframe, LatentPrior, Term
 
-_DRIFT_SIGMA_FRAMES = 3.0  # frames, sigma, over which the motion of planted toes is averaged
 _CLEARANCE_RAMP = 8.0  # frames next to ones in which a toe was observed over which the clearance term rises
 _NOISE_SHARE = 0.35  # sigma of the proposal where it was observed, as a share of the capture's noise
 
@@ -166,24 +164,6 @@ def _extrapolate_backward(pose: BodyPose) -> GroundPose:
     if len(heading) == 1:
         return here
     return here.before(rotations.rotate_ground(ground[1] - ground[0], -heading[0]), heading[1] - heading[0])
-
-
-def anchor_to_contacts(motion: Motion, contacts: Bool[Tensor, "frames 2"]) -> Motion:
-    """Correct the trajectory so that planted toes, on average over a few frames, do not travel.
-
-    For captures whose body drifts against its feet. Feet may still roll or turn while planted.
-    """
-    toes = motion.skeleton.indices(TOES)
-    ground = motion.joint_positions()[:, toes][..., ::2]
-    step = torch.diff(ground, dim=0, prepend=ground[:1])
-    planted = (contacts & torch.cat([contacts[:1], contacts[:-1]])).to(step)
-    weight = gaussian.pairwise_weights(len(step), _DRIFT_SIGMA_FRAMES, step.dtype)
-    drift = torch.einsum("ts,sfc,sf->tc", weight, step, planted)
-    # Far from any contact the drift is unknown, and fades out.
-    drift = drift / (torch.einsum("ts,sf->t", weight, planted) + 0.5)[:, None]
-    path = torch.cumsum(drift, dim=0)
-    offset = torch.stack([path[:, 0], torch.zeros_like(path[:, 0]), path[:, 1]], dim=-1)
-    return replace(motion, root_position=motion.root_position - offset)
 
 
 def estimate_rest_height(motion: Motion, contacts: Bool[Tensor, "frames 2"]) -> Float[Tensor, "frames 2"]:

@@ -14,15 +14,17 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from typing import Literal, TypeAlias
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy import linalg, ndimage
 from torch import Tensor
 
-from controllers.common.map_refinement import RefinedMotion, RefinementSettings, anchor_to_contacts, refine
+from controllers.common.map_refinement import RefinedMotion, RefinementSettings, refine
 from controllers.denoising.solution import DenoiseSolution, join_segments, move_frames
 from mapctl import rotations
-from mapctl.contacts import debounced
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery
@@ -75,6 +77,9 @@ _OVERLAP_SECONDS = 2.0  # seconds that two segments share
 _LEAD_SIGMAS = 3.0  # noise of an angle within which a joint of a lead pose may differ from what is expected
 
 
+CaptureKind: TypeAlias = Literal["studio", "video"]
+
+
 @dataclass(frozen=True)
 class DenoiseSettings:
     """Noise of the capture, and settings of the search."""
@@ -83,8 +88,9 @@ class DenoiseSettings:
     """Noise of each of a joint's angles, degrees; estimated from the capture, joint by joint, if None."""
     sigma_cm: float | None = None
     """Noise of each coordinate of the hips, centimetres; estimated from the capture if None."""
-    anchor: bool = False
-    """Whether the trajectory is corrected so that planted feet do not travel, for captures that drift."""
+    capture: CaptureKind = "studio"
+    """Whether the trajectory is as good as the pose, or drifts and floats as in estimates from video: then planted feet
+    and the floor correct it."""
     refinement: RefinementSettings = field(default_factory=RefinementSettings)
     """Settings of the MAP stage."""
 
@@ -226,7 +232,7 @@ def _denoise_segment(
     at = (torch.arange(shown.num_frames) * fps / PRIOR_FPS).round().long().clamp(max=last)
     contacts = contacts[at]
     refined = refine(
-        anchor_to_contacts(shown, debounced(contacts > 0)) if settings.anchor else shown,
+        put_on_floor(shown) if settings.capture == "video" else shown,
         contacts,
         observation.capture(shown, at),
         settings.refinement,
@@ -238,7 +244,7 @@ def _denoise_segment(
     changed = transfer_change(fused, shown, refined.motion, seconds)
     clean, notes = from_canonical(changed, observation.rigmap, observation.repaired), ()
     faults = _list_faults(inspection, observation.rigmap, clean, shown, refined)
-    whole = bool(inspection.known.all() and inspection.seen_root.all()) and not terms
+    whole = bool(inspection.known.all() and inspection.seen_root.all()) and not terms and settings.capture == "studio"
     if whole and _measure_roughness(clean) > _measure_roughness(motion):
         start = first_frame / PRIOR_FPS
         notes = (f"frames from {start:.1f} s on would become rougher than they are: they were not changed",)
@@ -257,6 +263,51 @@ def _denoise_segment(
         error=error[at],
         density_intervals=refined.density_intervals(motion),
     )
+
+
+_FLOOR_SECONDS, _FLOOR_SMOOTH = 1.2, 0.2  # seconds in which a foot is on the floor, and sigma of the floor's height
+_FLOOR_PERCENTILE = 15  # of the lower toe's height in that time
+_NEAR, _SLOW = 0.03, 0.3  # metres over the floor and m/s at which a toe hardly stands
+_SIGMA_STANDING, _SIGMA_STEP, _SIGMA_POSITION = 0.05, 0.15, 0.1  # m/s of a toe that stands, m/s and metres of the hips
+_ROUNDS = 4  # solves: what stands is known by speeds, which a solve changes
+
+
+def put_on_floor(motion: Motion) -> Motion:
+    """Correct the trajectory of a canonical motion whose hips drift and float although its pose is right.
+
+    The floor, the smoothed low percentile of the lower toe, is brought to the height at which toes rest in most frames.
+    Over the ground hips x minimise, by frame and coordinate, w (dx + df)^2 / s_standing^2 + (dx - do)^2 / s_step^2 +
+    (x - o)^2 / s_position^2 with the captured hips o, toes f about the hips, and weights w of toes that are low and
+    slow: a tridiagonal system, solved again as the speeds change (iteratively reweighted least squares, Holland and
+    Welsch 1977).
+    """
+    fps, root = float(motion.fps), motion.root_position.numpy()
+    toes = motion.joint_positions()[:, motion.skeleton.indices(TOES)].numpy()
+    lower = toes[..., 1].min(axis=1)
+    window = 2 * round(_FLOOR_SECONDS * fps / 2) + 1
+    floor = ndimage.percentile_filter(lower, _FLOOR_PERCENTILE, window, mode="nearest")
+    floor = ndimage.gaussian_filter1d(floor, _FLOOR_SMOOTH * fps, mode="nearest")
+    above = toes[..., 1] - floor[:, None]
+    near = np.exp(-np.maximum(above[1:], above[:-1]).clip(0) / _NEAR)
+    seen = root[:, [0, 2]]
+    steps, swings = np.diff(seen, axis=0), np.diff(toes[..., [0, 2]] - seen[:, None], axis=0)
+    ground, frames, step = seen, len(root), (fps / _SIGMA_STEP) ** 2
+    for _ in range(_ROUNDS):
+        speed = fps * np.linalg.norm(np.diff(ground, axis=0)[:, None] + swings, axis=-1)
+        stands = near / (1 + (speed / _SLOW) ** 2) * (fps / _SIGMA_STANDING) ** 2
+        weight = stands.sum(axis=1) + step
+        pulled = step * steps - (stands[..., None] * swings).sum(axis=1)
+        bands, right = np.zeros((2, frames)), seen / _SIGMA_POSITION**2
+        bands[1] = 1 / _SIGMA_POSITION**2
+        bands[1, :-1] += weight
+        bands[1, 1:] += weight
+        bands[0, 1:] = -weight
+        right[1:] += pulled
+        right[:-1] -= pulled
+        ground = linalg.solveh_banded(bands, right)
+    height = root[:, 1] - floor + np.median(floor)
+    moved = torch.from_numpy(np.stack([ground[:, 0], height, ground[:, 1]], axis=1))
+    return replace(motion, root_position=moved.to(motion.root_position))
 
 
 def _measure_roughness(motion: Motion) -> float:

@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 import priors
 from controllers.denoising.causal import denoise_causal
-from controllers.denoising.denoise import DenoiseSettings, denoise
+from controllers.denoising.denoise import CaptureKind, DenoiseSettings, denoise
 from controllers.denoising.solution import DenoiseSolution
 from mapctl import formats, report
 from mapctl.commands.shared import folders, inputs, options, outputs, results
@@ -36,8 +36,9 @@ class Denoise(ModelCommand, options.RigOptions):
     mask: options.MaybeFile = None
     """CSV with the columns joint, start, stop: frames (from 0, stop exclusive) in which a joint of the rig is missing.
     `*` is everything, `root position` the body's position. What is nan in IN is missing too."""
-    anchor: bool = False
-    """Correct the trajectory so that planted feet do not travel, for captures in which the body drifts against them."""
+    capture: CaptureKind = "studio"
+    """`video`: correct the trajectory so that planted feet neither travel nor leave the floor, for estimates from
+    video, whose body drifts and floats. `studio`: the trajectory is as good as the pose."""
     causal: bool = False
     """Denoise as for live capture: a frame is decided at most `--delay` after it arrives."""
     delay: options.MaybeNumber = None
@@ -75,6 +76,8 @@ _DEFAULT_DELAY = 0.2  # seconds
 def run(command: Denoise) -> int:
     if command.causal and command.prior is not None:
         raise RequestError("--causal has no time for a density; leave --prior out")
+    if command.causal and command.capture == "video":
+        raise RequestError("--capture video finds the floor from the whole capture; leave it or --causal out")
     if command.causal and command.inbetweener is not None:
         raise RequestError("--causal leaves what is lost to the denoiser; leave --inbetweener out")
     if command.delay is not None and not command.causal:
@@ -98,7 +101,7 @@ def run(command: Denoise) -> int:
 
 
 def _denoise_file(command: Denoise) -> DenoiseSolution:
-    settings, rig = DenoiseSettings(anchor=command.anchor), inputs.read_rig(command.rig, command)
+    settings, rig = DenoiseSettings(capture=command.capture), inputs.read_rig(command.rig, command)
     named_masks = () if command.mask is None else load_masks(command.mask)
     densities = priors.load_choice(command.prior)
     denoiser = priors.load_denoiser(command.denoiser)
@@ -218,7 +221,7 @@ class FileDenoiser:
         if not command.quiet:
             inputs.print_doubts(source, motion, self.rig)
         masks, (denoiser, inbetweener) = masks_from_missing(motion, missing), _load(self.denoiser, self.inbetweener)
-        settings = DenoiseSettings(anchor=command.anchor)
+        settings = DenoiseSettings(capture=command.capture)
         done = denoise(motion, denoiser, inbetweener=inbetweener, masks=masks, settings=settings, rig=self.rig)
         own = {str(source): weight_sets.shorten_licence(motion.licence)} if motion.licence else {}
         if command.report is not None:

@@ -235,7 +235,7 @@ def _ask_for_walk(
 
 def clean_up(at: Scene, frames: range, *, anchor: bool) -> Job:
     """Denoise the action in these frames."""
-    words = ["denoise", "IN", "-o", "OUT", *(["--anchor"] if anchor else [])]
+    words = ["denoise", "IN", "-o", "OUT", *(["--capture", "video"] if anchor else [])]
     generated = np.zeros(len(frames), dtype=bool)
     return (yield from _edit(at, frames, words, generated, "clean", "cleaning up"))
 
