@@ -97,8 +97,8 @@ class SteerSettings:
     evaluations: int = 6
     """Most evaluations of energy and gradient in a step."""
     least_evaluations: int = 4
-    """Evaluations for which the loop gives a step time, however late it is: with fewer, targets are missed
-    (docs/reference/results.md). Never more than `evaluations`."""
+    """Evaluations for which the loop gives a step time, however late it is: with fewer, commands are missed. Never more
+    than `evaluations`."""
     limits: SteeringLimits = field(default_factory=SteeringLimits)
     """How fast a steering target may change."""
     sigma_speed: float = RootVelocity.sigma_speed
