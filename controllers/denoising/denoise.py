@@ -66,7 +66,7 @@ from mapctl.recording.masks import (
 from mapctl.recording.noise_estimation import choose_continuous_signs, estimate_angle_noise, estimate_position_noise
 from mapctl.retarget import RigMap, as_rig, from_canonical, identify_rig, to_canonical
 from mapctl.retarget.rigs import Rig
-from mapctl.skeleton import CANONICAL, TOES, leg_length
+from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, TOES, leg_length
 from mapctl.terms import Term
 
 MIN_DENOISE_FRAMES = 8
@@ -275,7 +275,7 @@ _ROUNDS = 4  # solves: what stands is known by speeds, which a solve changes
 def put_on_floor(motion: Motion) -> Motion:
     """Correct the trajectory of a canonical motion whose hips drift and float although its pose is right.
 
-    The floor, the smoothed low percentile of the lower toe, is brought to the height at which toes rest in most frames.
+    The floor, the smoothed low percentile of the lower toe, is brought to the height at which toes rest over y = 0.
     Over the ground hips x minimise, by frame and coordinate, w (dx + df)^2 / s_standing^2 + (dx - do)^2 / s_step^2 +
     (x - o)^2 / s_position^2 with the captured hips o, toes f about the hips, and weights w of toes that are low and
     slow: a tridiagonal system, solved again as the speeds change (iteratively reweighted least squares, Holland and
@@ -305,7 +305,8 @@ def put_on_floor(motion: Motion) -> Motion:
         right[1:] += pulled
         right[:-1] -= pulled
         ground = linalg.solveh_banded(bands, right)
-    height = root[:, 1] - floor + np.median(floor)
+    rest = TOE_REST_HEIGHT * leg_length(motion.skeleton) / leg_length(CANONICAL)
+    height = root[:, 1] - floor + rest
     moved = torch.from_numpy(np.stack([ground[:, 0], height, ground[:, 1]], axis=1))
     return replace(motion, root_position=moved.to(motion.root_position))
 

@@ -322,7 +322,10 @@ def step(state: SteerState, command: Command, *, seconds: float | None = None) -
     if steps is None and needs_steps(command, float(state.committed.ground_pose.heading)):
         command = replace(command, speed=0.0, heading=command.hips_heading)  # it comes to rest first
     state = replace(state, steps=steps, stand=None)
-    targets = steps.targets_of(settings.horizon) if steps else _plan_targets(state, command)
+    if steps is None:
+        targets = state.target.ahead(command, settings.limits, frames=settings.horizon, fps=PRIOR_FPS)
+    else:
+        targets = steps.targets_of(settings.horizon)
     conditioned = replace(state, prior=condition_prior(state.prior, command.labels))
     if steps is None:
         noise = replace(settings.noise, centre=_draw_noise(state))
@@ -532,11 +535,6 @@ def commit_frames(state: SteerState, new: Float[Tensor, "frames size"]) -> Commi
         joints_world=joints[-_JUDGED_FRAMES:],
         warm_start=committed.warm_start[:0],
     ).discard_history(KEPT_FRAMES)
-
-
-def _plan_targets(state: SteerState, command: Command) -> list[SteeringTarget]:
-    settings = state.settings
-    return state.target.ahead(command, settings.limits, frames=settings.horizon, fps=PRIOR_FPS)
 
 
 def _recent_velocity(state: SteerState) -> Float[Tensor, "2"]:

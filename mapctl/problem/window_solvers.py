@@ -39,6 +39,7 @@ _STEERING = [
     for column in range(LAYOUT.slices[block].start, LAYOUT.slices[block].stop)
 ]
 """Columns of the noise that the swarm searches."""
+_KNOTS, _SPREAD = 4, 0.7  # over the window, and standard deviation of draws at each, in units of the noise
 
 
 @dataclass(frozen=True)
@@ -50,10 +51,6 @@ class SwarmProposal:
 
     settings: SwarmSettings = field(default_factory=SwarmSettings)
     """Number of particles and iterations; with one iteration the best of random draws."""
-    knots: int = 4
-    """Number of knots."""
-    spread: float = 0.7
-    """Standard deviation of draws at each knot, in units of the noise, whose own is 1."""
 
     def __call__(
         self, request: WindowRequest, warm: Float[Tensor, "1 unknowns"], meter: Meter
@@ -61,7 +58,7 @@ class SwarmProposal:
         """Return the best point of the swarm, each under its own plan; the meter counts what was evaluated."""
 
         def unknowns(points: Float[Tensor, "batch size"]) -> Float[Tensor, "batch unknowns"]:
-            at_knots = torch.unflatten(points.to(warm.dtype), -1, (self.knots, -1)).transpose(1, 2)
+            at_knots = torch.unflatten(points.to(warm.dtype), -1, (_KNOTS, -1)).transpose(1, 2)
             noise = warm.new_zeros(len(points), request.context.frames, LAYOUT.continuous)
             dense = torch.nn.functional.interpolate(at_knots, size=noise.shape[1], mode="linear", align_corners=True)
             noise[..., _STEERING] = dense.transpose(1, 2)
@@ -72,9 +69,9 @@ class SwarmProposal:
             with torch.no_grad():
                 return Objective(LatentNoise.from_unknowns(request.context, noise).build, request.terms).energy(noise)
 
-        start = torch.zeros(self.knots * len(_STEERING))
+        start = torch.zeros(_KNOTS * len(_STEERING))
         found = run_swarm(
-            energy, start=start, spread=self.spread, settings=self.settings, meter=meter, generator=request.generator
+            energy, start=start, spread=_SPREAD, settings=self.settings, meter=meter, generator=request.generator
         )
         return unknowns(found.x[None])
 

@@ -17,7 +17,7 @@ PARENTS = [-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18,
 
 
 def write(path, joints=24, up="z", seed=0, **changed):
-    """Somebody who stands, leans and bends arms and legs somewhat, in an archive as estimators write it."""
+    """Write parameters of a standing body with small rotations of all joints, as estimators do."""
     random = np.random.default_rng(seed)
     poses = random.normal(0, 0.2, (9, joints, 3))
     poses[:, 0] = (UP[up] * Rotation.from_rotvec(random.normal(0, 0.2, (9, 3)))).as_rotvec()
