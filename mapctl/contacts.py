@@ -191,13 +191,13 @@ def _average_around(values: Float[ndarray, "frames 2"]) -> Float[ndarray, "frame
     return scipy.ndimage.uniform_filter1d(values, 2 * REACH + 1, axis=0, mode="constant") / count[:, None]
 
 
-_REST_SPEED, _SWING_SPEED = 0.07, 1.7
+REST_SPEED, _SWING_SPEED = 0.07, 1.7
 """Standard deviation of the velocity of planted toes and of others along an axis, m/s: held-out walks, runs and
 gestures of the training sets."""
 _LEAN = 0.26
 """Standard deviation, radians, of the angle between the vertical and the line from a planted toe to the hips: the same
 clips."""
-_LEVEL = 0.02
+TOE_LEVEL = 0.02
 """Standard deviation of the height of a toe that rests on one level, metres: captured feet roll and shoes give."""
 _GRADIENT = 0.1
 """Standard deviation of the gradient of a floor: ramps for wheelchairs have 1:12."""
@@ -218,7 +218,7 @@ def compute_rest_log_probability(
     normal about the vertical where a toe carries them, uniform over the sphere elsewhere.
     """
     steps = toes.diff(dim=0, prepend=2 * toes[:1] - toes[1:2] if len(toes) > 1 else toes) * fps
-    rest, swing = (speed_noise.square() + speed**2 for speed in (_REST_SPEED, _SWING_SPEED))
+    rest, swing = (speed_noise.square() + speed**2 for speed in (REST_SPEED, _SWING_SPEED))
     resting = 1.5 * torch.log(swing / rest) - 0.5 * steps.square().sum(dim=-1) * (1 / rest - 1 / swing)
     up = hips[:, None] - toes
     lean = torch.atan2(up[..., ::2].norm(dim=-1), up[..., 1])
@@ -244,7 +244,7 @@ def fit_supports(
             variances.append(0.0 if noise is None else float(noise[start:stop, foot].square().mean()))
             counted.append(mask is planted)
             spans.append((foot, start, stop))
-    heights = _fit_local_planes(torch.stack(points), toes.new_tensor(variances) + _LEVEL**2, torch.tensor(counted))
+    heights = _fit_local_planes(torch.stack(points), toes.new_tensor(variances) + TOE_LEVEL**2, torch.tensor(counted))
     supports = torch.empty_like(toes[..., 1])
     for (foot, start, stop), height in zip(spans, heights, strict=True):
         supports[start:stop, foot] = height

@@ -5,8 +5,10 @@
    in-betweener proposes what is lost for longer.
 3. Evidence test (`mapctl.recording.fusion`): the proposal is fused with the capture by the noise that the capture
    itself shows, so that on unfamiliar motion the result is a filter of the capture.
-4. Refinement (`controllers.common.map_refinement`): the MAP problem about the fused motion plants the feet.
-5. Result: on the capture's own rig, at its own rate, with all of its frames; the input where it would become rougher.
+4. Trajectory (`controllers.denoising.trajectory`): where hips drift about standing toes, as in estimates from video,
+   these correct it.
+5. Refinement (`controllers.common.map_refinement`): the MAP problem about the fused motion plants the feet.
+6. Result: on the capture's own rig, at its own rate, with all of its frames; the input where it would become rougher.
 """
 
 import math
@@ -16,14 +18,13 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Literal, TypeAlias
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy import linalg, ndimage
 from torch import Tensor
 
 from controllers.common.map_refinement import RefinedMotion, RefinementSettings, refine
 from controllers.denoising.solution import DenoiseSolution, join_segments, move_frames
+from controllers.denoising.trajectory import correct_trajectory
 from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
@@ -66,7 +67,7 @@ from mapctl.recording.masks import (
 from mapctl.recording.noise_estimation import choose_continuous_signs, estimate_angle_noise, estimate_position_noise
 from mapctl.retarget import RigMap, as_rig, from_canonical, identify_rig, to_canonical
 from mapctl.retarget.rigs import Rig
-from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, TOES, leg_length
+from mapctl.skeleton import CANONICAL, TOES, leg_length
 from mapctl.terms import Term
 
 MIN_DENOISE_FRAMES = 8
@@ -77,7 +78,7 @@ _OVERLAP_SECONDS = 2.0  # seconds that two segments share
 _LEAD_SIGMAS = 3.0  # noise of an angle within which a joint of a lead pose may differ from what is expected
 
 
-CaptureKind: TypeAlias = Literal["studio", "video"]
+CaptureKind: TypeAlias = Literal["auto", "studio", "video"]
 
 
 @dataclass(frozen=True)
@@ -88,9 +89,9 @@ class DenoiseSettings:
     """Noise of each of a joint's angles, degrees; estimated from the capture, joint by joint, if None."""
     sigma_cm: float | None = None
     """Noise of each coordinate of the hips, centimetres; estimated from the capture if None."""
-    capture: CaptureKind = "studio"
-    """Whether the trajectory is as good as the pose, or drifts and floats as in estimates from video: then planted feet
-    and the floor correct it."""
+    capture: CaptureKind = "auto"
+    """Whether the trajectory is as good as the pose (`studio`), or drifts and floats as in estimates from `video`: then
+    standing toes correct it. `auto` decides by how fast those slide in the first segment; a causal run leaves it."""
     refinement: RefinementSettings = field(default_factory=RefinementSettings)
     """Settings of the MAP stage."""
 
@@ -147,6 +148,7 @@ def denoise(
         first_frame = round((lead + start) / fps * PRIOR_FPS)
         done = _denoise_segment(part, denoiser, part_masks, settings, densities, terms, rig, first_frame)
         pieces.append((done, start))
+        settings = replace(settings, capture="studio" if done.drift is None else "video")  # all segments alike
         start = stop - shared
         if progress is not None:
             progress(lead + stop, motion.num_frames)
@@ -226,13 +228,18 @@ def _denoise_segment(
     observation = _Observation.of(inspection, settings, rig)
     proposal, contacts, spread = _propose(observation, denoiser)
     fused, share, error = _fuse(observation, proposal)
+    from_video = settings.capture == "video" or (settings.capture == "auto" and _drifts(fused))
+    if from_video:
+        observation = observation.with_noise(settings, slow=True)
+        fused, share, error = _fuse(observation.completed(proposal), None)
     error = torch.where(observation.seen, error, spread)  # where nothing was observed, the model's own estimate
     shown = fused.resample(PRIOR_FPS)
     fps, last = float(motion.fps), motion.num_frames - 1
     at = (torch.arange(shown.num_frames) * fps / PRIOR_FPS).round().long().clamp(max=last)
     contacts = contacts[at]
+    found = correct_trajectory(shown) if from_video else None
     refined = refine(
-        put_on_floor(shown) if settings.capture == "video" else shown,
+        shown if found is None else found.motion,
         contacts,
         observation.capture(shown, at),
         settings.refinement,
@@ -243,13 +250,21 @@ def _denoise_segment(
     seconds = torch.arange(shown.num_frames, dtype=torch.float64) / PRIOR_FPS
     changed = transfer_change(fused, shown, refined.motion, seconds)
     clean, notes = from_canonical(changed, observation.rigmap, observation.repaired), ()
+    if found is not None and settings.capture == "auto":
+        notes = (
+            f"standing toes slide at {100 * found.drift:.0f} cm/s, as in estimates from video: hips are moved so that"
+            " they are still, on the floor at y = 0; --capture studio leaves them",
+        )
     faults = _list_faults(inspection, observation.rigmap, clean, shown, refined)
-    whole = bool(inspection.known.all() and inspection.seen_root.all()) and not terms and settings.capture == "studio"
+    whole = bool(inspection.known.all() and inspection.seen_root.all()) and not terms and found is None
     if whole and _measure_roughness(clean) > _measure_roughness(motion):
         start = first_frame / PRIOR_FPS
-        notes = (f"frames from {start:.1f} s on would become rougher than they are: they were not changed",)
+        clean, notes = (
+            motion,
+            (f"frames from {start:.1f} s on would become rougher than they are: they were not changed",),
+        )
     return DenoiseSolution(
-        motion if notes else clean,
+        clean,
         Status(Outcome.DONE, notes),
         refined.ledger,
         refined.windows,
@@ -262,53 +277,8 @@ def _denoise_segment(
         proposal_share=share[at],
         error=error[at],
         density_intervals=refined.density_intervals(motion),
+        drift=None if found is None else found.drift,
     )
-
-
-_FLOOR_SECONDS, _FLOOR_SMOOTH = 1.2, 0.2  # seconds in which a foot is on the floor, and sigma of the floor's height
-_FLOOR_PERCENTILE = 15  # of the lower toe's height in that time
-_NEAR, _SLOW = 0.03, 0.3  # metres over the floor and m/s at which a toe hardly stands
-_SIGMA_STANDING, _SIGMA_STEP, _SIGMA_POSITION = 0.05, 0.15, 0.1  # m/s of a toe that stands, m/s and metres of the hips
-_ROUNDS = 4  # solves: what stands is known by speeds, which a solve changes
-
-
-def put_on_floor(motion: Motion) -> Motion:
-    """Correct the trajectory of a canonical motion whose hips drift and float although its pose is right.
-
-    The floor, the smoothed low percentile of the lower toe, is brought to the height at which toes rest over y = 0.
-    Over the ground hips x minimise, by frame and coordinate, w (dx + df)^2 / s_standing^2 + (dx - do)^2 / s_step^2 +
-    (x - o)^2 / s_position^2 with the captured hips o, toes f about the hips, and weights w of toes that are low and
-    slow: a tridiagonal system, solved again as the speeds change (iteratively reweighted least squares, Holland and
-    Welsch 1977).
-    """
-    fps, root = float(motion.fps), motion.root_position.numpy()
-    toes = motion.joint_positions()[:, motion.skeleton.indices(TOES)].numpy()
-    lower = toes[..., 1].min(axis=1)
-    window = 2 * round(_FLOOR_SECONDS * fps / 2) + 1
-    floor = ndimage.percentile_filter(lower, _FLOOR_PERCENTILE, window, mode="nearest")
-    floor = ndimage.gaussian_filter1d(floor, _FLOOR_SMOOTH * fps, mode="nearest")
-    above = toes[..., 1] - floor[:, None]
-    near = np.exp(-np.maximum(above[1:], above[:-1]).clip(0) / _NEAR)
-    seen = root[:, [0, 2]]
-    steps, swings = np.diff(seen, axis=0), np.diff(toes[..., [0, 2]] - seen[:, None], axis=0)
-    ground, frames, step = seen, len(root), (fps / _SIGMA_STEP) ** 2
-    for _ in range(_ROUNDS):
-        speed = fps * np.linalg.norm(np.diff(ground, axis=0)[:, None] + swings, axis=-1)
-        stands = near / (1 + (speed / _SLOW) ** 2) * (fps / _SIGMA_STANDING) ** 2
-        weight = stands.sum(axis=1) + step
-        pulled = step * steps - (stands[..., None] * swings).sum(axis=1)
-        bands, right = np.zeros((2, frames)), seen / _SIGMA_POSITION**2
-        bands[1] = 1 / _SIGMA_POSITION**2
-        bands[1, :-1] += weight
-        bands[1, 1:] += weight
-        bands[0, 1:] = -weight
-        right[1:] += pulled
-        right[:-1] -= pulled
-        ground = linalg.solveh_banded(bands, right)
-    rest = TOE_REST_HEIGHT * leg_length(motion.skeleton) / leg_length(CANONICAL)
-    height = root[:, 1] - floor + rest
-    moved = torch.from_numpy(np.stack([ground[:, 0], height, ground[:, 1]], axis=1))
-    return replace(motion, root_position=moved.to(motion.root_position))
 
 
 def _measure_roughness(motion: Motion) -> float:
@@ -330,6 +300,8 @@ class _Observation:
     """Noise of canonical joints' angles, radians."""
     sigma_root: float
     """Noise of the hips' position, metres."""
+    noise_rate: float
+    """Samples a second up to which that noise is white."""
 
     @staticmethod
     def of(inspection: Inspection, settings: DenoiseSettings, rig: Rig) -> "_Observation":
@@ -339,13 +311,30 @@ class _Observation:
         canonical = replace(canonical, local_quat_xyzw=choose_continuous_signs(canonical.local_quat_xyzw))
         seen, above_hips = _map_to_canonical(inspection.known, rigmap)
         seen_root = inspection.seen_root & above_hips
-        sigma = estimate_angle_noise(canonical.local_quat_xyzw, seen)
+        silent = torch.zeros(CANONICAL.num_joints)
+        return _Observation(repaired, rigmap, canonical, seen, seen_root, silent, 0.0, math.inf).with_noise(settings)
+
+    def with_noise(self, settings: DenoiseSettings, *, slow: bool = False) -> "_Observation":
+        """Estimate the noise as far as the settings do not give it: of every frame, or what is slow as from video."""
+        step = max(1, round(float(self.canonical.fps) / _VIDEO_NOISE_RATE)) if slow else 1
+        sigma = estimate_angle_noise(self.canonical.local_quat_xyzw[::step], self.seen[::step])
         if settings.sigma_deg is not None:
             # Joints that never move have no noise either: they are locked, or the rig has none there.
             sigma = torch.where(sigma > 0, math.radians(settings.sigma_deg), 0.0).to(sigma)
-        root = estimate_position_noise(canonical.root_position, seen_root)
+        root = estimate_position_noise(self.canonical.root_position[::step], self.seen_root[::step])
         sigma_root = root if settings.sigma_cm is None else settings.sigma_cm / 100
-        return _Observation(repaired, rigmap, canonical, seen, seen_root, sigma, sigma_root)
+        rate = float(self.canonical.fps) / step
+        return replace(self, sigma=sigma, sigma_root=sigma_root, noise_rate=rate)
+
+    def completed(self, proposal: Motion) -> "_Observation":
+        """Fill in what was not observed by the proposal: of noise slower than the frames the denoiser keeps more than
+        a smoother of what was observed."""
+        quats = torch.where(self.seen[..., None], self.canonical.local_quat_xyzw, proposal.local_quat_xyzw)
+        root = torch.where(self.seen_root[:, None], self.canonical.root_position, proposal.root_position)
+        canonical = replace(self.canonical, root_position=root, local_quat_xyzw=quats)
+        return replace(
+            self, canonical=canonical, seen=torch.ones_like(self.seen), seen_root=torch.ones_like(self.seen_root)
+        )
 
     def capture(
         self, motion: Motion, at: Tensor, shown: Tensor | bool = True, *, kept: float = 1.0, scale: float = 1.0
@@ -428,20 +417,36 @@ def _propose(
     return motion, follow(cleaned.contact_logits[0]), follow(cleaned.log_spread[0, :, 1:].double()).exp()
 
 
+def _drifts(motion: Motion) -> bool:
+    """Return whether standing toes slide as in estimates from video, tremor aside."""
+    fps, weights = float(motion.fps), torch.ones(motion.num_frames, motion.num_joints, dtype=torch.float64)
+    quats = smooth_columns(motion.local_quat_xyzw, weights, _DRIFT_HERTZ, fps)
+    root = smooth_columns(motion.root_position[:, None], weights[:, :1], _DRIFT_HERTZ, fps)[:, 0]
+    smooth = replace(motion, root_position=root, local_quat_xyzw=torch.nn.functional.normalize(quats, dim=-1))
+    return correct_trajectory(smooth.resample(PRIOR_FPS)).is_video
+
+
+_DRIFT_HERTZ = 3.0  # half-power frequency of what is not tremor
+_VIDEO_NOISE_RATE = 15.0  # samples a second up to which noise of estimates from video is white
 _LOW_PASS = 0.4  # of the rate of the frames that the denoiser sees: what is faster would be folded into them
 
 
 def _fuse(
-    observation: _Observation, proposal: Motion
+    observation: _Observation, proposal: Motion | None
 ) -> tuple[Motion, Float[Tensor, "frames joints"], Float[Tensor, "frames joints"]]:
-    """Fuse the proposal with the capture; also the share of the proposal, and the error, radians, that remains."""
-    capture, fps = observation.canonical, float(observation.canonical.fps)
-    turned = fuse_rotations(proposal.local_quat_xyzw, capture.local_quat_xyzw, observation.seen, observation.sigma, fps)
+    """Fuse the proposal, if there is one, with the capture; also the share of the proposal, and the error, radians,
+    that remains."""
+    capture, noise_rate = observation.canonical, observation.noise_rate
+    angles, positions = (None, None) if proposal is None else (proposal.local_quat_xyzw, proposal.root_position)
+    fps = float(capture.fps)
+    turned = fuse_rotations(angles, capture.local_quat_xyzw, observation.seen, observation.sigma, fps, noise_rate)
     moved = fuse_positions(
-        proposal.root_position, capture.root_position, observation.seen_root, observation.sigma_root, fps
+        positions, capture.root_position, observation.seen_root, observation.sigma_root, fps, noise_rate
     )
     quats = rotations.make_sign_continuous(turned.values)
-    fused = replace(proposal, root_position=moved.values[:, 0], local_quat_xyzw=quats)
+    fused = replace(
+        capture, skeleton=observation.rigmap.skeleton, root_position=moved.values[:, 0], local_quat_xyzw=quats
+    )
     return fused, turned.share, turned.error
 
 

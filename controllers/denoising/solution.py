@@ -42,14 +42,18 @@ class DenoiseSolution(Solution):
     """By frame at PRIOR_FPS and canonical joint: 1 where the proposal was used, 0 where the smoothed capture was."""
     error: Float[Tensor, "frames canonical"]
     """Estimated error that remains in each of a joint's angles, in the same frames, radians (standard deviation)."""
+    drift: float | None = None
+    """Speed at which standing toes slid in the capture, m/s, where its trajectory was corrected by them."""
     rig: Rig | None = None
     """The rig as it was identified."""
     density_intervals: tuple[DensityInterval, ...] = ()
     """Density and its weight in each window, in frames of the capture; empty where none was given."""
 
     def assess(self) -> "DenoiseSolution":
-        """Return the solution whose status is that the network was out of its depth where it was in more than half."""
-        out_of_depth = float(self.proposal_share.mean()) < _FALLBACK_SHARE and bool(self.noise.max() > 0)
+        """Return the solution whose status is that the network was out of its depth where it was in more than half; of
+        a capture from video it proposes nothing that was observed."""
+        used = float(self.proposal_share.mean()) >= _FALLBACK_SHARE or self.drift is not None
+        out_of_depth = not used and bool(self.noise.max() > 0)
         outcome = Outcome.OUT_OF_DEPTH if out_of_depth else Outcome.DONE
         return replace(self, status=replace(self.status, outcome=outcome))
 
@@ -80,6 +84,7 @@ class DenoiseSolution(Solution):
             "rig": None if self.rig is None else self.rig.name,
             "noise_deg": dict(zip(names, torch.rad2deg(self.noise).tolist(), strict=True)),
             "noise_root_cm": 100 * self.noise_root,
+            "drift_cm_s": None if self.drift is None else 100 * self.drift,
             "error_deg": dict(zip(CANONICAL.names, torch.rad2deg(self.error.mean(dim=0)).tolist(), strict=True)),
             "faults": [vars(fault) for fault in self.faults],
             "correction_cm": dict(zip(names, moved.tolist(), strict=True)),

@@ -36,9 +36,10 @@ class Denoise(ModelCommand, options.RigOptions):
     mask: options.MaybeFile = None
     """CSV with the columns joint, start, stop: frames (from 0, stop exclusive) in which a joint of the rig is missing.
     `*` is everything, `root position` the body's position. What is nan in IN is missing too."""
-    capture: CaptureKind = "studio"
-    """`video`: correct the trajectory so that planted feet neither travel nor leave the floor, for estimates from
-    video, whose body drifts and floats. `studio`: the trajectory is as good as the pose."""
+    capture: CaptureKind = "auto"
+    """`video`: move the hips so that standing toes neither slide nor leave the floor at y = 0, for estimates from
+    video, whose body drifts and floats. `studio`: the trajectory is as good as the pose. `auto`: as video where
+    standing toes slide faster than captured ones do, but not under a walk in place."""
     causal: bool = False
     """Denoise as for live capture: a frame is decided at most `--delay` after it arrives."""
     delay: options.MaybeNumber = None
@@ -130,6 +131,8 @@ def _format_certainty(done: DenoiseSolution) -> list[str]:
     if not any(fault.kind == "noise" for fault in done.faults):
         return []
     error, used = math.degrees(float(done.error.square().mean().sqrt())), done.proposal_share.mean(dim=0)
+    if done.drift is not None:  # from video the model proposes only what was not observed
+        return [f"expected error: {error:.1f} degrees a joint"]
     line = f"expected error: {error:.1f} degrees a joint; the model's proposal as it is in {float(used.mean()):.0%}"
     order = used.argsort().tolist()
     rare = [CANONICAL.names[joint] for joint in order if used[joint] < _LOW_SHARE][:_MAX_NAMED]

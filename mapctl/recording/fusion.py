@@ -56,27 +56,31 @@ def fuse_rotations(
     seen: Bool[Tensor, "frames joints"],
     sigma: Float[Tensor, " joints"],
     fps: float,
+    noise_rate: float = math.inf,
 ) -> Fused:
     """Estimate rotations (xyzw) from a capture with noise `sigma` of each angle, radians, and a proposal at its rate,
-    if there is one. Joints without noise keep what was observed."""
+    if there is one. Joints without noise keep what was observed. The noise is white up to `noise_rate` samples a
+    second, if that is less than the frames."""
 
     def turn(start: Tensor, vector: Tensor) -> Tensor:
         return rotations.multiply(start, rotations.from_rotation_vector(vector))
 
     capture, normalize = choose_continuous_signs(capture), partial(torch.nn.functional.normalize, dim=-1)
-    return _fuse(proposal, capture, seen, sigma, fps, rotations.turns_between, turn, normalize)
+    return _fuse(proposal, capture, seen, sigma, fps, rotations.turns_between, turn, normalize, noise_rate)
 
 
 def fuse_positions(
-    proposal: Float[Tensor, "frames 3"],
+    proposal: Float[Tensor, "frames 3"] | None,
     capture: Float[Tensor, "frames 3"],
     seen: Bool[Tensor, " frames"],
     sigma: float,
     fps: float,
+    noise_rate: float = math.inf,
 ) -> Fused:
-    """Estimate positions, metres, from a capture with noise `sigma` of each coordinate, and a proposal at its rate."""
+    """Estimate positions, metres, from a capture with noise `sigma` of each coordinate, as `fuse_rotations`."""
     level, difference = torch.tensor([sigma], dtype=torch.float64), lambda start, stop: stop - start
-    return _fuse(proposal[:, None], capture[:, None], seen[:, None], level, fps, difference, torch.add)
+    columns = None if proposal is None else proposal[:, None]
+    return _fuse(columns, capture[:, None], seen[:, None], level, fps, difference, torch.add, torch.clone, noise_rate)
 
 
 def _fuse(
@@ -87,7 +91,8 @@ def _fuse(
     fps: float,
     difference: Callable[[Tensor, Tensor], Tensor],
     add: Callable[[Tensor, Tensor], Tensor],
-    normalize: Callable[[Tensor], Tensor] = torch.clone,
+    normalize: Callable[[Tensor], Tensor],
+    noise_rate: float,
 ) -> Fused:
     """Fuse over seconds first, then over moments about that result, which keeps transients of the capture alone. The
     error is that of the first: near a result that follows the capture, the noise is underestimated."""
@@ -96,7 +101,9 @@ def _fuse(
     about, found = smooth[0] if proposal is None else proposal, []
     for scale in _SCALES:
         residual, others = difference(about, capture), [difference(about, each) for each in smooth]
-        vector, share, error = _estimate(residual, others, weights, sigma, fps, scale, holds_proposal=holds_proposal)
+        vector, share, error = _estimate(
+            residual, others, weights, sigma, fps, scale, noise_rate, holds_proposal=holds_proposal
+        )
         about, holds_proposal = add(about, vector), True
         found.append((share, error))
     return Fused(about, found[0][0] * found[1][0], found[0][1])
@@ -133,6 +140,7 @@ def _estimate(
     sigma: Float[Tensor, " columns"],
     fps: float,
     scale: tuple[float, float],
+    noise_rate: float,
     *,
     holds_proposal: bool,
 ) -> tuple[Float[Tensor, "frames columns 3"], Float[Tensor, "frames columns"], Float[Tensor, "frames columns"]]:
@@ -146,8 +154,10 @@ def _estimate(
     # The last is the capture itself: a transient that no smoother can follow is no noise.
     candidates, leverages = [residual], [_require_seen(ones, weights, holds_proposal)]
     for hertz, smooth in zip(_list_cutoffs(fps), smoothed, strict=True):
-        # Averaged like the changes, or the outermost frame, where leverage is largest, would be the proposal's alone.
-        leverage = _average(_compute_leverage(len(residual), hertz, fps)[:, None], ones[:, :1], fps, seconds)
+        # Of noise that is slower than the frames a smoother keeps a larger share. Averaged like the changes, or the
+        # outermost frame, where leverage is largest, would be the proposal's alone.
+        leverage = (_compute_leverage(len(residual), hertz, fps) * max(1.0, fps / noise_rate)).clamp(max=1)
+        leverage = _average(leverage[:, None], ones[:, :1], fps, seconds)
         # In a gap a smoother has little evidence: of the frames that it sees, how many are observed.
         shown = _average(weights, ones, fps, 1 / (4 * math.pi * hertz))
         leverage = _require_seen(leverage, shown, holds_proposal)

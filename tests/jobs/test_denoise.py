@@ -12,9 +12,11 @@ from helpers import generator, walk
 from performers import Performer
 from tiny_denoiser import QUICK, tiny_denoiser
 
-from controllers.denoising.denoise import LostPartFiller, denoise, put_on_floor
+from controllers.denoising.denoise import LostPartFiller, denoise
 from controllers.denoising.solution import join_segments
+from controllers.denoising.trajectory import correct_trajectory
 from mapctl import retarget, rotations
+from mapctl.editing import remove_travel
 from mapctl.inbetweening import Proposal
 from mapctl.motion import Motion
 from mapctl.protocols import Inbetweener
@@ -373,13 +375,18 @@ def test_denoising_takes_it_on_any_rig_and_at_any_rate(rig, fps):
     assert apart[: fps - fps // 3].max() < 0.01
 
 
+def wobbling(motion: Motion) -> Motion:
+    """A motion at 30 frames a second that drifts and floats as an estimate from video."""
+    seconds = torch.arange(motion.num_frames, dtype=torch.float64) / 30
+    wobble = torch.stack([torch.sin(4 * seconds), torch.sin(2 * seconds), torch.sin(5 * seconds + 1)], dim=-1)
+    moved = torch.tensor([0.03, 0.05, 0.05]) * wobble + torch.tensor([0.0, -0.4, 0.0])
+    return replace(motion, root_position=motion.root_position + moved)
+
+
 def test_a_body_that_drifts_and_floats_is_put_on_the_floor_by_its_feet():
     """Estimates from video drift; a capture without drift hardly changes."""
     walk = Performer().walks(240)
-    seconds, toes = torch.arange(240, dtype=torch.float64) / 30, walk.skeleton.indices(TOES)
-    wobble = torch.stack([torch.sin(4 * seconds), torch.sin(2 * seconds), torch.sin(5 * seconds + 1)], dim=-1)
-    wobble = torch.tensor([0.03, 0.05, 0.05]) * wobble + torch.tensor([0.0, -0.4, 0.0])
-    drifting = replace(walk, root_position=walk.root_position + wobble)
+    drifting, toes = wobbling(walk), walk.skeleton.indices(TOES)
 
     def measure(motion: Motion) -> tuple[float, float, float]:
         """Error over the ground and in height, metres, and speed of the lower toe, m/s."""
@@ -390,11 +397,40 @@ def test_a_body_that_drifts_and_floats_is_put_on_the_floor_by_its_feet():
         lower = speed[torch.arange(239), feet[1:, :, 1].argmin(dim=1)]
         return float(away[:, ::2].norm(dim=-1).mean()), float(away[:, 1].abs().mean()), float(lower.median())
 
-    before, after, studio = map(measure, (drifting, put_on_floor(drifting), put_on_floor(walk)))
+    corrected, unchanged, in_place = map(correct_trajectory, (drifting, walk, remove_travel(walk)))
+    before, after, studio = map(measure, (drifting, corrected.motion, unchanged.motion))
     assert after[0] < 0.5 * before[0]
     assert after[1] < 0.5 * before[1]
     assert before[2] > 0.1
     assert after[2] < 0.4 * before[2]
-    assert max(studio[:2]) < 0.02
-    lower = put_on_floor(drifting).joint_positions()[:, toes, 1].amin(dim=1)
+    assert max(studio[:2]) < 0.005
+    assert corrected.is_video
+    assert not unchanged.is_video
+    assert not in_place.is_video
+    lower = corrected.motion.joint_positions()[:, toes, 1].amin(dim=1)
     assert TOE_REST_HEIGHT - 0.01 < float(lower.median()) < TOE_REST_HEIGHT + 0.04
+
+
+def test_an_estimate_from_video_is_noticed_and_its_tremor_removed():
+    """Tremor below 8 Hz is no noise to a studio's camera; white noise is no tremor."""
+    walk, draw = Performer().walks(240), generator(1)
+    slow = torch.randn(122, walk.num_joints * 3, generator=draw, dtype=torch.float64)
+    tremor = torch.nn.functional.interpolate(slow.T[None], size=240, mode="linear")[0].T.unflatten(-1, (-1, 3))
+    turned = rotations.from_rotation_vector(0.03 * tremor)
+    video = wobbling(replace(walk, local_quat_xyzw=rotations.multiply(walk.local_quat_xyzw, turned)))
+
+    def measure(motion: Motion) -> tuple[float, float]:
+        """Error about the hips, metres, and mean third difference."""
+        about = [each.joint_positions() - each.root_position[:, None] for each in (motion, walk)]
+        return float((about[0] - about[1]).norm(dim=-1).mean()), float(about[0].diff(n=3, dim=0).norm(dim=-1).mean())
+
+    done = denoise(video, tiny_denoiser(), settings=QUICK)
+    assert done.drift is not None
+    assert "as in estimates from video" in done.notes[0]
+    (before, rough), (after, smooth) = measure(video), measure(done.motion)
+    assert after < 0.8 * before
+    assert smooth < 0.3 * rough
+    for capture in (walk, noisy(walk, degrees=1.0, centimetres=0.3)):
+        assert denoise(capture, tiny_denoiser(), settings=QUICK).drift is None
+    studio = replace(QUICK, capture="studio")
+    assert denoise(video, tiny_denoiser(), settings=studio).drift is None

@@ -89,6 +89,20 @@ def test_a_kick_that_the_proposal_misses_survives(fps):
     assert float(apart_deg(fused.values, wanted)[~during & ((time - 4).abs() > 1.5)].mean()) < 1.0
 
 
+def test_noise_slower_than_the_frames_is_smoothed_where_its_rate_is_given():
+    """Tremor as of video: noise drawn 15 times a second, in a capture of 60 frames a second."""
+    wanted, fps = truth(60.0), 60.0
+    slow = torch.randn(len(wanted) // 4 + 2, wanted.shape[1], 3, generator=generator(), dtype=torch.float64)
+    tremor = torch.nn.functional.interpolate(slow.flatten(1).T[None], size=len(wanted), mode="linear")[0].T
+    turned = rotations.from_rotation_vector(2 * DEGREE * tremor.unflatten(-1, (-1, 3)))
+    capture, level = rotations.multiply(wanted, turned), torch.full_like(LEVEL, 2 * DEGREE)
+    white, given = (
+        fuse_rotations(None, capture, everywhere(wanted), level, fps, rate).values for rate in (math.inf, 15.0)
+    )
+    assert error(given, wanted) < 0.75 * error(white, wanted)
+    assert error(given, wanted) < 0.6 * error(capture, wanted)
+
+
 def test_without_noise_the_capture_is_the_truth_and_gaps_are_the_proposals():
     wanted = truth(30.0)
     seen = everywhere(wanted)

@@ -1,0 +1,130 @@
+"""Correct the trajectory of a capture from video: the pose is right, but the hips drift and float about it.
+
+A MAP problem, linear once it is known which toes stand, solved in turn with that (iteratively reweighted least squares,
+Holland and Welsch 1977).
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+from scipy import linalg, ndimage, special
+
+from mapctl import rotations
+from mapctl.contacts import REST_SPEED, TOE_LEVEL, compute_rest_log_probability
+from mapctl.motion import Motion
+from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, TOES, leg_length
+
+_CAPTURED_DRIFT, _STANCE_SECONDS = 0.12, 1.5  # m/s below which captured hips drift, and stance that shows it
+_CORRELATION_SECONDS = 0.2  # time over which the drift's velocity is correlated
+_LEAST_DRIFT = 0.01  # m/s
+_SINK_SPEED, _SINK_HEIGHT = 0.1, 0.5  # m/s by which, and metres to which, heights drift
+_SWING_HEIGHT = 0.3  # metres over the floor within which a toe swings
+_FLOOR_SECONDS, _FLOOR_PERCENTILE = 1.2, 15  # of the lower toe's height: the floor of the first solve
+_VELOCITY_ERRORS = (0.3, 0.2, 0.12, 0.08, 0.05, 0.05)
+"""Error of the hips' velocity, m/s, before each solve: what is unsure at first decides late (graduated non-convexity,
+Blake and Zisserman 1987)."""
+
+
+@dataclass(frozen=True, eq=False)
+class CorrectedTrajectory:
+    """A motion whose standing toes neither slide nor leave the floor."""
+
+    motion: Motion
+    drift: float
+    """Standard deviation of the velocity, m/s, at which standing toes slid."""
+    steady: float
+    """Speed, m/s, of their mean velocity in the body's own frame: high under a walk in place, or feet that land and
+    leave fast."""
+
+    seconds: float
+    """Time for which either toe stands."""
+
+    @property
+    def is_video(self) -> bool:
+        """Whether the hips drift about the toes, rather than travel steadily over them, faster than captured ones."""
+        return self.seconds >= _STANCE_SECONDS and self.drift >= _CAPTURED_DRIFT and self.steady < self.drift / 2
+
+
+def correct_trajectory(motion: Motion) -> CorrectedTrajectory:
+    """Find the hips under which the standing toes of a canonical motion are still, on the floor at y = 0.
+
+    Coordinates x of the hips minimise the sum over frames of w (dx + df)^2 / s_rest^2 + (dx - do)^2 / s^2 + (x - o)^2 /
+    s_0^2, with captured hips o, toes f about the hips, and weights w, the probability that a toe stands: slow, below
+    the hips and low. The drift s is estimated from the velocity of standing toes (empirical Bayes), so that hips over
+    toes that are still stay; s_0 is s over its time of correlation. Heights have w (x + f - r)^2 / s_level^2 in
+    addition, r the height at which toes rest.
+    """
+    fps, hips = float(motion.fps), motion.root_position.numpy()
+    toes = motion.joint_positions()[:, motion.skeleton.indices(TOES)].numpy()
+    about, lower = toes - hips[:, None], toes[..., 1].min(axis=1)
+    rest = TOE_REST_HEIGHT * leg_length(motion.skeleton) / leg_length(CANONICAL)
+    window = 2 * round(_FLOOR_SECONDS * fps / 2) + 1
+    floor = ndimage.percentile_filter(lower, _FLOOR_PERCENTILE, window, mode="nearest")
+    found = hips + np.outer(rest - floor, (0, 1, 0))
+    captured = hips + np.array([0, rest - np.median(floor), 0])
+    heading = rotations.split_heading(motion.local_quat_xyzw[1:, 0])[0]
+    slide = rotations.rotate_ground(fps * torch.from_numpy(toes[..., [0, 2]]).diff(dim=0), -heading[:, None]).numpy()
+    drift, stands = 0.0, np.zeros(slide.shape[:2])
+    for error in _VELOCITY_ERRORS:
+        standing = _weigh_standing(about, found, rest, fps, error)
+        stands = np.minimum(standing[1:], standing[:-1])
+        # Of two normal coordinates the speed's median is sqrt(ln 4) of their standard deviation (Rayleigh).
+        drift = _weighted_median(np.linalg.norm(slide, axis=-1), stands) / math.sqrt(math.log(4))
+        drift = max(_LEAST_DRIFT, math.sqrt(max(0.0, drift**2 - REST_SPEED**2)))
+        prior = (drift, _CORRELATION_SECONDS * drift)
+        ground = _solve(captured[:, [0, 2]], about[..., [0, 2]], stands, fps, prior)
+        levels = standing / TOE_LEVEL**2, rest - about[..., 1]
+        height = _solve(captured[:, 1:2], about[..., 1:2], stands, fps, (_SINK_SPEED, _SINK_HEIGHT), levels)
+        found = np.stack([ground[:, 0], height[:, 0], ground[:, 1]], axis=1)
+    steady = (stands[..., None] * slide).sum(axis=(0, 1)) / max(stands.sum(), 1e-9)
+    corrected = torch.from_numpy(found).to(motion.root_position)
+    seconds = float(stands.max(axis=1).sum()) / fps
+    return CorrectedTrajectory(replace(motion, root_position=corrected), drift, float(np.hypot(*steady)), seconds)
+
+
+def _weigh_standing(
+    about: Float[ndarray, "frames 2 3"], hips: Float[ndarray, "frames 3"], rest: float, fps: float, error: float
+) -> Float[ndarray, "frames 2"]:
+    """Weigh toes by the probability that they stand: at rest under the hips, and at the height of the floor."""
+    toes = torch.from_numpy(about + hips[:, None])
+    speed_noise = torch.full((1, 1), error, dtype=toes.dtype)
+    resting = compute_rest_log_probability(toes, torch.from_numpy(hips), fps, speed_noise).exp().numpy()
+    above = (toes[..., 1].numpy() - rest) / TOE_LEVEL
+    return resting * special.expit(math.log(_SWING_HEIGHT / (TOE_LEVEL * math.sqrt(2 * math.pi))) - 0.5 * above**2)
+
+
+def _solve(
+    captured: Float[ndarray, "frames axes"],
+    about: Float[ndarray, "frames 2 axes"],
+    stands: Float[ndarray, "steps 2"],
+    fps: float,
+    prior: tuple[float, float],
+    levels: tuple[Float[ndarray, "frames 2"], Float[ndarray, "frames 2"]] | None = None,
+) -> Float[ndarray, "frames axes"]:
+    """Solve the tridiagonal system of coordinates of the hips; `prior` is the standard deviation of the drift's
+    velocity, m/s, and of its size, metres, `levels` weights and values of coordinates of the hips that toes show."""
+    speed, size = prior
+    still, steady = stands * (fps / REST_SPEED) ** 2, (fps / speed) ** 2
+    weight = still.sum(axis=1) + steady
+    pulled = steady * np.diff(captured, axis=0) - (still[..., None] * np.diff(about, axis=0)).sum(axis=1)
+    bands, right = np.zeros((2, len(captured))), captured / size**2
+    bands[1] = 1 / size**2
+    if levels is not None:
+        bands[1] += levels[0].sum(axis=1)
+        right += (levels[0] * levels[1]).sum(axis=1)[:, None]
+    bands[1, :-1] += weight
+    bands[1, 1:] += weight
+    bands[0, 1:] = -weight
+    right[1:] += pulled
+    right[:-1] -= pulled
+    return linalg.solveh_banded(bands, right)
+
+
+def _weighted_median(values: Float[ndarray, "steps 2"], weights: Float[ndarray, "steps 2"]) -> float:
+    order = values.argsort(axis=None)
+    total = weights.ravel()[order].cumsum()
+    return float(values.ravel()[order][min(len(total) - 1, total.searchsorted(total[-1] / 2))])
