@@ -26,8 +26,8 @@ CHARACTERS = (*_GLTF, *_USD, ".fbx")
 _MAY_LACK_VALUES = {".bvh": "bvh", ".npz": "npz", ".amc": "acclaim"}
 READERS = {**_MAY_LACK_VALUES, **dict.fromkeys(_GLTF, "gltf"), **dict.fromkeys(_USD, "usd"), ".fbx": "fbx"}
 """Endings that are read, each with its module of this package, which is imported when it is needed."""
-_ONLY_READ = (".fbx", ".gltf", ".usdz", ".amc")
-WRITERS = {ending: module for ending, module in READERS.items() if ending not in _ONLY_READ}
+_ONLY_READ = (".gltf", ".usdz", ".amc")
+WRITERS = {ending: module for ending, module in READERS.items() if ending not in _ONLY_READ} | {".fbx": "fbx_out"}
 """Endings that are written, likewise."""
 _NEEDED = {
     "pxr": "USD needs the package usd-core: pip install 'mapctl[usd]'",
@@ -167,3 +167,7 @@ def check_ending(path: str | PathLike[str]) -> None:
         raise RequestError(f"cannot write {path}: {why}; allowed: {', '.join(WRITERS)}")
     if ending in USD_WRITTEN and find_spec("pxr") is None:
         raise RequestError(f"cannot write {path}: {_NEEDED['pxr']}")
+    if ending == ".fbx":
+        from mapctl.formats import fbx_out
+
+        fbx_out.find_blender()

@@ -1,4 +1,4 @@
-"""FBX in, by the package ufbx: characters and captures, as rigs and as clips. FBX is not written.
+"""FBX in, by the package ufbx: characters and captures, as rigs and as clips.
 
 `find_character` and all below it run in `mapctl.formats.sandbox`, without torch.
 """
