@@ -1,4 +1,4 @@
-"""Script that Blender runs to write an FBX: `python write_fbx.py REQUEST`, or `blender --python write_fbx.py -- REQUEST`.
+"""Script by which Blender writes FBX: `python write_fbx.py REQUEST`, or `blender --python write_fbx.py -- REQUEST`.
 
 REQUEST is an .npz of `mapctl.formats.fbx_out`. Blender's own Python has numpy, but not what mapctl needs.
 """
@@ -21,7 +21,7 @@ from mapctl.blender.addon.process import AddonError
 REFUSED = 3
 """Exit status where the last line of standard error is a reason for the user."""
 _CENTIMETRES = 100.0
-_SHORTEST = 1.0  # centimetres; Blender deletes bones without length
+_UP = np.array([0.0, 5.0, 0.0])  # a bone of a joint, centimetres; one along Y is aligned with the world
 _MOST_FPS = 32767
 
 
@@ -38,6 +38,9 @@ def write(request: dict[str, np.ndarray]) -> None:
     scene.frame_start, scene.frame_end = 0, len(request["positions"]) - 1
     _write_keys(armature, names, request["rotations"], request["positions"])
     scene.frame_set(-1)  # the pose of this frame is that of the file's nodes
+    for each in bpy.data.objects:
+        for modifier in each.modifiers:
+            modifier.show_viewport = False  # else the mesh is posed in every frame, for nothing
     bpy.ops.export_scene.fbx(
         filepath=str(request["out"]),
         add_leaf_bones=False,
@@ -84,8 +87,6 @@ def _build_armature(request: dict[str, np.ndarray], names: list[str]) -> bpy.typ
     bones = []
     for name, head, parent in zip(names, rest, parents, strict=True):
         bones.append(_add_bone(armature, name, head, bones[parent] if parent >= 0 else None))
-        if parent >= 0:
-            bones[parent].length = max(np.linalg.norm(head - rest[parent]), _SHORTEST)
     for name, end in zip(request["end_names"].tolist(), request["end_offsets"], strict=True):
         joint = names.index(name)
         _add_bone(armature, f"{name}_end", rest[joint] + _CENTIMETRES * end, bones[joint])
@@ -98,7 +99,7 @@ def _add_bone(armature: bpy.types.Object, name: str, head: np.ndarray, parent):
     bone = armature.data.edit_bones.new(name)
     if bone.name != name:
         raise AddonError(f"Blender has no bone named {name!r}; shorten the name, or write .glb or .usda")
-    bone.head, bone.tail, bone.parent = head.tolist(), (head + (0.0, 5.0, 0.0)).tolist(), parent
+    bone.head, bone.tail, bone.parent = head.tolist(), (head + _UP).tolist(), parent
     return bone
 
 

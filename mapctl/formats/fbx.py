@@ -20,6 +20,7 @@ _MAX_ELEMENTS = 2**20
 _BODY_JOINTS = 8
 """Two trees of at least as many joints, below one node and without a common skin, are two characters."""
 _USUAL_RATE = 30.0
+_MODE_119_88 = 18  # of the FBX SDK, which ufbx 0.0.5 reads as 24 frames a second
 _EARLY_SHARE = 0.02  # of a frame by which a take may end before it
 _MOVED = ("Lcl Translation", "Lcl Rotation", "Lcl Scaling")
 _kept: list[object] = []
@@ -282,6 +283,8 @@ def _sample(
 ) -> parts.Poses:
     outer = line_of(armature.nodes[0])[:0:-1]
     rate = scene.settings.frames_per_second
+    if ufbx.find_int(scene.settings.props, "TimeMode", 0) == _MODE_119_88:
+        rate = 120 / 1.001
     rate = rate if np.isfinite(rate) and 0.01 <= rate <= 1e5 else _USUAL_RATE
     if not (np.isfinite(begin) and np.isfinite(end)) or end < begin:
         raise Refusal(f"animation {name!r} lasts from {begin:g} to {end:g} s")

@@ -24,8 +24,8 @@ from mapctl.motion import Motion
 BLENDER = "MAPCTL_BLENDER"
 """Environment variable that names a Blender, or a Python with bpy."""
 NEEDED = (
-    "FBX is written by Blender: install it from blender.org, or in Python 3.11 pip install --no-deps bpy; its program is"
-    f" found on PATH, or named by {BLENDER}"
+    "FBX is written by Blender: install it from blender.org and put its program on PATH, or name it, or a Python with"
+    f" the package bpy, by the environment variable {BLENDER}; or write .glb, .usda or .bvh"
 )
 
 
@@ -37,7 +37,7 @@ def find_blender() -> list[str]:
         raise RequestError(NEEDED if named == "blender" else f"{BLENDER} names {named}, which is no program")
     if Path(program).name.lower().startswith("python"):
         return [program, WRITE_FBX]
-    return [program, "--background", "--factory-startup", "--python", WRITE_FBX, "--"]
+    return [program, "--background", "--factory-startup", "--python-exit-code", "1", "--python", WRITE_FBX, "--"]
 
 
 def save(motion: Motion, path: str | PathLike[str]) -> None:
@@ -60,6 +60,7 @@ def save(motion: Motion, path: str | PathLike[str]) -> None:
         request = Path(folder) / "request.npz"
         np.savez(
             request,
+            allow_pickle=False,
             names=np.array(motion.skeleton.names),
             fps=np.array([motion.fps.numerator, motion.fps.denominator]),
             rotations=rotations.to_matrix(turns).numpy(),
