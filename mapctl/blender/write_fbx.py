@@ -4,6 +4,7 @@ REQUEST is an .npz of `mapctl.formats.fbx_out`. Blender's own Python has numpy, 
 """
 
 import os
+import shutil
 import sys
 from pathlib import Path
 
@@ -25,11 +26,12 @@ _UP = np.array([0.0, 5.0, 0.0])  # a bone of a joint, centimetres; one along Y i
 _MOST_FPS = 32767
 
 
-def write(request: dict[str, np.ndarray]) -> None:
-    """Write the motion on the character's file of the request, else on an armature with its mesh."""
+def write(request: dict[str, np.ndarray], folder: Path) -> None:
+    """Write the motion on the character's file of the request, else on an armature with its mesh; `folder` is for
+    files in the meantime."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    character, names = str(request["character"]), request["names"].tolist()
-    armature = _import_armature(character, names) if character else _build_armature(request, names)
+    names = request["names"].tolist()
+    armature = (_import_armature if "character" in request else _build_armature)(request, names)
     numerator, denominator = request["fps"].tolist()
     scene = bpy.context.scene
     scene.name = str(request["name"])  # which the exporter takes as the name of the animation
@@ -41,19 +43,27 @@ def write(request: dict[str, np.ndarray]) -> None:
     for each in bpy.data.objects:
         for modifier in each.modifiers:
             modifier.show_viewport = False  # else the mesh is posed in every frame, for nothing
+    packed = any(image.packed_file for image in bpy.data.images)  # textures within the file, named by its own name
+    written = Path(folder, f"{scene.name}.fbx") if packed else Path(str(request["out"]))
     bpy.ops.export_scene.fbx(
-        filepath=str(request["out"]),
+        filepath=str(written),
         add_leaf_bones=False,
         bake_anim_use_nla_strips=False,
         bake_anim_use_all_actions=False,
         bake_anim_simplify_factor=0.0,
         use_custom_props=True,
-        **_choose_texture_paths(),
+        colors_type="SRGB" if "character" in request else "LINEAR",  # as they came; as Maya and Unreal take them
+        path_mode="COPY" if packed else "RELATIVE",
+        embed_textures=packed,
     )
+    if packed:
+        shutil.copyfile(written, str(request["out"]))
 
 
-def _import_armature(path: str, names: list[str]) -> bpy.types.Object:
-    """Import a character's file and return the armature with these joints; AddonError where it has none."""
+def _import_armature(request: dict[str, np.ndarray], names: list[str]) -> bpy.types.Object:
+    """Import the character's file and return the armature with the joints, of several the one of its name; AddonError
+    where it has none."""
+    path, armature = str(request["character"]), str(request["armature"])
     if "fbx_import" in dir(bpy.ops.wm):  # since Blender 4.5; also of text, which the older one does not read
         bpy.ops.wm.fbx_import(filepath=path, use_anim=False)
     else:
@@ -65,9 +75,14 @@ def _import_armature(path: str, names: list[str]) -> bpy.types.Object:
     }
     if not lacking:
         raise AddonError("Blender finds no armature in the character's file; write .glb or .usda")
-    found = min(lacking, key=lambda each: len(lacking[each]))
+    found = min(lacking, key=lambda each: (len(lacking[each]), each.name != armature))
     if lacking[found]:
         raise AddonError(f"Blender imports the character without its joint {lacking[found][0]!r}; write .glb or .usda")
+    bpy.context.view_layer.objects.active = found
+    bpy.ops.object.mode_set(mode="EDIT")
+    for bone in found.data.edit_bones:
+        bone.use_connect = False  # connected ones do not travel
+    bpy.ops.object.mode_set(mode="OBJECT")
     return found
 
 
@@ -180,17 +195,11 @@ def _key(armature: bpy.types.Object, moved, bone: str, turns: np.ndarray, points
         write_channel(armature, Channel(path, bone or armature.name, values), frames, generated)
 
 
-def _choose_texture_paths() -> dict[str, object]:
-    """Choose to keep textures in the file where some are, else the files that they are in."""
-    packed = any(image.packed_file for image in bpy.data.images)
-    return {"path_mode": "COPY", "embed_textures": True} if packed else {"path_mode": "RELATIVE"}
-
-
 if __name__ == "__main__":
     with np.load(sys.argv[-1], allow_pickle=False) as archive:
         arrays = dict(archive)
     try:
-        write(arrays)
+        write(arrays, Path(sys.argv[-1]).parent)
     except (AddonError, RuntimeError) as error:  # the latter of Blender's operators
         print(" ".join(str(error).split()), file=sys.stderr, flush=True)
         os._exit(REFUSED)

@@ -286,6 +286,8 @@ def _sample(
     if ufbx.find_int(scene.settings.props, "TimeMode", 0) == _MODE_119_88:
         rate = 120 / 1.001
     rate = rate if np.isfinite(rate) and 0.01 <= rate <= 1e5 else _USUAL_RATE
+    if abs(1.001 * rate - round(1.001 * rate)) < 1e-3:  # 29.97, which is rounded
+        rate = round(1.001 * rate) / 1.001
     if not (np.isfinite(begin) and np.isfinite(end)) or end < begin:
         raise Refusal(f"animation {name!r} lasts from {begin:g} to {end:g} s")
     count = np.floor((end - begin) * rate + _EARLY_SHARE) + 1

@@ -55,7 +55,7 @@ def save(motion: Motion, path: str | PathLike[str]) -> None:
     else:
         source.check_unchanged()
         turns = rotations.multiply(turns, torch.from_numpy(source.frames.quat_xyzw))
-        character = {"character": str(source.path)}
+        character = {"character": str(source.path), "armature": source.armature}
     with atomic_path(path) as scratch, tempfile.TemporaryDirectory() as folder:
         request = Path(folder) / "request.npz"
         np.savez(
@@ -86,7 +86,6 @@ def _describe_body(motion: Motion) -> dict[str, object]:
     name, body = build_skinned_body(motion)
     vertices, _ = body.pose(rest, np.tile(np.eye(3), (len(rest), 1, 1)))
     return {
-        "character": "",
         "parents": skeleton.parents,
         "rest": rest,
         "end_names": np.array(list(skeleton.end_offsets), dtype=np.str_),
