@@ -137,7 +137,7 @@ def test_every_layout_is_read_as_that_of_amass(layout, tmp_path, capsys):
 
 
 def test_a_world_of_gvhmr_has_y_up_however_the_body_lies(tmp_path):
-    parameters = make_smpl_parameters(4)
+    parameters = make_smpl_parameters(4) | {"transl": torch.zeros(4, 3)}
     parameters["global_orient"] = torch.tensor([[math.pi / 2, 0.0, 0.0]]).repeat(4, 1)
     torch.save({"smpl_params_global": parameters}, tmp_path / "a.pt")
     lying = formats.load(tmp_path / "a.pt")
