@@ -101,7 +101,8 @@ def test_any_format_to_any_format(every_format, capsys, source, ending):
     again = mapctl.load(f"out{ending}")
     names = [name for name in motion.skeleton.names if ending != ".vrma" or name in again.skeleton.names]  # bones alone
     where, there = ([one.skeleton.index(name) for name in names] for one in (again, motion))  # BVH nests depth first
-    np.testing.assert_allclose(again.joint_positions()[:, where], motion.joint_positions()[:, there], atol=5e-6)
+    near = 2e-5 if ending == ".fbx" else 5e-6  # Blender's poses have single precision
+    np.testing.assert_allclose(again.joint_positions()[:, where], motion.joint_positions()[:, there], atol=near)
     assert Path(f"out{ending}").stat().st_size > 1000
 
 

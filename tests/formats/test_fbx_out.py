@@ -119,8 +119,10 @@ def test_motion_is_put_on_the_users_own_file(blender, tmp_path, monkeypatch):
 
 
 def move(motion):
-    """The same character in other poses, with a joint that travels in its parent."""
-    random, last = generator(), motion.num_joints - 1
+    """The same character in other poses, with joints that travel in their parents: one at the tip of the parent's bone
+    as Blender draws it, and one beside it."""
+    random, skeleton = generator(), motion.skeleton
+    above = next(k for k in range(1, motion.num_joints) if skeleton.offsets[k][1] > 0.99 * skeleton.offsets[k].norm())
 
     def draw(*shape):
         return torch.randn(*shape, 3, generator=random, dtype=torch.float64)
@@ -129,7 +131,7 @@ def move(motion):
         motion,
         root_position=draw(7),
         local_quat_xyzw=rotations.from_rotation_vector(0.3 * draw(7, motion.num_joints)),
-        moving_offsets={last: motion.skeleton.offsets[last] + 0.05 * draw(7)},
+        moving_offsets={k: skeleton.offsets[k] + 0.05 * draw(7) for k in (above, motion.num_joints - 1)},
     )
 
 
