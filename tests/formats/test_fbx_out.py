@@ -122,7 +122,7 @@ def move(motion):
     """The same character in other poses, with joints that travel in their parents: one at the tip of the parent's bone
     as Blender draws it, and one beside it."""
     random, skeleton = generator(), motion.skeleton
-    above = next(k for k in range(1, motion.num_joints) if skeleton.offsets[k][1] > 0.99 * skeleton.offsets[k].norm())
+    above = max(k for k in range(1, motion.num_joints) if skeleton.offsets[k][1] > 0.99 * skeleton.offsets[k].norm())
 
     def draw(*shape):
         return torch.randn(*shape, 3, generator=random, dtype=torch.float64)
