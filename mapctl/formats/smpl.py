@@ -165,12 +165,11 @@ def read(
     """Read the parameters of a .pt or .pth. FileFormatError where it holds other objects than tensors, or none."""
     raw = read_bytes(path)
     try:
-        content = torch.load(io.BytesIO(raw), map_location="cpu", weights_only=True)
+        found = _find_parameters(torch.load(io.BytesIO(raw), map_location="cpu", weights_only=True))
     except Exception as error:  # whatever a forged file leads torch's parsers to
-        objects = "it holds objects, whose reading may run code" if isinstance(error, UnpicklingError) else ""
-        why = objects or f"is no sound file of torch: {one_line(error)}"
+        objects = "is broken or holds objects, whose reading may run code"
+        why = objects if isinstance(error, UnpicklingError) else f"is no sound file of torch: {one_line(error)}"
         raise FileFormatError(path, f"{why}; save the parameters as tensors, or as an .npz") from error
-    found = _find_parameters(content)
     if found is None:
         raise FileFormatError(path, f"holds no SMPL parameters: tensors named {' or '.join(POSES)}")
     found, up = (found[_GLOBAL], _AS_IS) if _GLOBAL in found else (found, None)
@@ -259,7 +258,8 @@ def _read_rotations(
 ) -> Float[Tensor, "frames joints 4"]:
     """Read rotation vectors or matrices of one of the numbers of joints, with or without axes for joints and rows."""
     values = np.asarray(given)
-    size = values.size // frames if values.dtype.kind == "f" and values.ndim > 1 and len(values) == frames else 0
+    by_frame = values.ndim > 1 and (len(values) == frames or frames == 1)  # one frame may be without its axis
+    size = values.size // frames if values.dtype.kind == "f" and by_frame else 0
     joints = next((count for count in counts if size in (3 * count, 9 * count)), None)
     if joints is None:
         expected = " or ".join(f"({frames}, {3 * count})" for count in counts)

@@ -136,6 +136,14 @@ def test_every_layout_is_read_as_that_of_amass(layout, tmp_path, capsys):
     assert formats.load(file, fps=25).fps == 25
 
 
+def test_one_frame_may_be_without_its_axis(tmp_path):
+    parameters = {key: value.numpy() for key, value in make_smpl_parameters(1).items()}
+    np.savez(tmp_path / "a.npz", **parameters)
+    np.savez(tmp_path / "b.npz", **parameters | {"body_pose": parameters["body_pose"].reshape(21, 3)})
+    motions = [formats.load(tmp_path / name) for name in ("a.npz", "b.npz")]
+    np.testing.assert_array_equal(motions[0].joint_positions(), motions[1].joint_positions())
+
+
 def test_a_world_of_gvhmr_has_y_up_however_the_body_lies(tmp_path):
     parameters = make_smpl_parameters(4) | {"transl": torch.zeros(4, 3)}
     parameters["global_orient"] = torch.tensor([[math.pi / 2, 0.0, 0.0]]).repeat(4, 1)
