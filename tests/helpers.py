@@ -295,3 +295,18 @@ pose_frame = 40
 place = [0.3, 1.5]
 """
 """Keys of every kind for `tween`, on the rig of in.bvh."""
+
+
+def make_smpl_parameters(frames: int, *, joints: int = 21, seed: int = 0) -> dict[str, Tensor]:
+    """Parameters of a standing body, Y up, as estimators from video save them: `joints` of `body_pose`."""
+    random = generator(seed)
+
+    def draw(size: int, spread: float) -> Tensor:
+        return spread * torch.randn(frames, size, generator=random)
+
+    return {
+        "global_orient": draw(3, 0.2),
+        "body_pose": draw(3 * joints, 0.2),
+        "transl": draw(3, 1.0),
+        "betas": draw(10, 1.0)[:1].repeat(frames, 1),
+    }

@@ -30,15 +30,16 @@ class Convert(Command, options.ReadOptions):
     """
 
     source: Positional[Annotated[Path, arg(metavar="IN|FOLDER")]]
-    """.bvh, .npz (mapctl's, or SMPL parameters as in AMASS), or .amc: its skeleton is the .asf of the same name,
-    else the only one in the folder, else named as in subject.asf+take.amc. Of a character (.glb, .gltf, .vrm, .vrma,
-    .usda, .usdc, .usd, .usdz, .fbx) its first animation, else one frame of its rest pose; hero.glb#ARMATURE,
-    hero.glb#ARMATURE/ANIMATION and hero.glb#/ANIMATION choose others. Or a folder, every motion below it."""
+    """.bvh, .npz (mapctl's, or SMPL parameters), .pt (SMPL parameters, as of GVHMR), or .amc: its skeleton is the .asf
+    of the same name, else the only one in the folder, else named as in subject.asf+take.amc. Of a character (.glb,
+    .gltf, .vrm, .vrma, .usda, .usdc, .usd, .usdz, .fbx) its first animation, else one frame of its rest pose;
+    hero.glb#ARMATURE, hero.glb#ARMATURE/ANIMATION and hero.glb#/ANIMATION choose others. Or a folder, every motion
+    below it."""
     out: Positional[Annotated[Path, arg(metavar="OUT|FOLDER")]]
-    """.bvh, .npz, or with a skinned body .glb, .usda, .usdc or .usd: that of the character in IN or in --rig, where it
-    came from such a file, else a mannequin. A .vrm is written of a VRM character only. A .vrma holds motion
-    alone: of the bones of a VRM, or of any rig's canonical joints. Of a folder another one, which gets the same
-    names."""
+    """.bvh, .npz, or with a skinned body .glb, .usda, .usdc, .usd or .fbx (by Blender, which must be installed): that
+    of the character in IN or in --rig, where it came from such a file, else a mannequin. A .vrm is written of a VRM
+    character only. A .vrma holds motion alone: of the bones of a VRM, or of any rig's canonical joints. Of a folder
+    another one, which gets the same names."""
     to: Annotated[str | None, arg(metavar=".ENDING")] = None
     """For a folder: the ending of all results, as .glb; their own if not given, or .bvh."""
     rig: Annotated[str | None, arg(metavar="canonical|PRESET|FILE.toml|CLIP")] = None
@@ -63,7 +64,7 @@ class Convert(Command, options.ReadOptions):
     fps: Annotated[str | None, arg(metavar="F")] = None
     """Frames per second, as 30, 29.97 or 30000/1001: positions linear, rotations by slerp."""
     fps_in: Annotated[str | None, arg(metavar="F")] = None
-    """Frames per second of an .amc, which are not in the file; 120 unless given."""
+    """Frames per second of a file that does not state them: an .amc, 120 unless given, or SMPL parameters, 30."""
     mirror: bool = False
     """Exchange left and right, on the same bones, through the plane x = 0."""
     loop: bool = False
@@ -104,7 +105,7 @@ class Conversion:
     fps: Fraction | None
     """Frames per second of the result."""
     fps_in: Fraction | None
-    """Frames per second of an .amc."""
+    """Frames per second of a file that does not state them."""
     source_rig: Rig | None
     body: RiggedCharacter | None = None
     """Body that gets the motion; None for the canonical joints, or for the motion's own."""
@@ -126,11 +127,9 @@ class Conversion:
 
     def convert(self, source: Path) -> Converted:
         command, rig, notes = self.command, self.source_rig, list[str]()
-        # Of other files than .amc the rate is in the file.
-        fps_in = self.fps_in if source.suffix.lower() == ".amc" or not command.source.is_dir() else None
-        motion = inputs.read_motion(source, rig, fps=fps_in, quiet=command.quiet)
-        if command.smpl_model is not None:
-            motion = smpl.fit_bones(motion, command.smpl_model)
+        may_lack = source.suffix.lower() in formats.MAY_LACK_RATE
+        fps_in = self.fps_in if may_lack or not command.source.is_dir() else None
+        motion = inputs.read_motion(source, rig, fps=fps_in, body_model=command.smpl_model, quiet=command.quiet)
         edited = command.mirror or command.loop or command.plant_feet or command.in_place or command.root_motion
         if edited and command.rig is None:  # before frames are cut, since the whole clip shows the rig
             rig = as_rig(identify_rig(motion.skeleton, rig, motion=motion))

@@ -24,10 +24,19 @@ _GLTF, _USD = (".glb", ".gltf", ".vrm", ".vrma"), (*USD_WRITTEN, ".usdz")
 CHARACTERS = (*_GLTF, *_USD, ".fbx")
 """Endings of files of characters, that have a rest pose of their own."""
 _MAY_LACK_VALUES = {".bvh": "bvh", ".npz": "npz", ".amc": "acclaim"}
-READERS = {**_MAY_LACK_VALUES, **dict.fromkeys(_GLTF, "gltf"), **dict.fromkeys(_USD, "usd"), ".fbx": "fbx"}
+_TORCH = (".pt", ".pth")
+READERS = {
+    **_MAY_LACK_VALUES,
+    **dict.fromkeys(_TORCH, "smpl"),
+    **dict.fromkeys(_GLTF, "gltf"),
+    **dict.fromkeys(_USD, "usd"),
+    ".fbx": "fbx",
+}
 """Endings that are read, each with its module of this package, which is imported when it is needed."""
-_ONLY_READ = (".fbx", ".gltf", ".usdz", ".amc")
-WRITERS = {ending: module for ending, module in READERS.items() if ending not in _ONLY_READ}
+_ONLY_READ = (*_TORCH, ".gltf", ".usdz", ".amc")
+MAY_LACK_RATE = (".amc", ".npz", *_TORCH)
+"""Endings of files that need not state their frame rate."""
+WRITERS = {ending: module for ending, module in READERS.items() if ending not in _ONLY_READ} | {".fbx": "fbx_out"}
 """Endings that are written, likewise."""
 _NEEDED = {
     "pxr": "USD needs the package usd-core: pip install 'mapctl[usd]'",
@@ -65,14 +74,14 @@ def load(
 
     Of a character's file it is an animation, or one frame of the rest pose where there is none; `hero.glb#ARMATURE`,
     `hero.glb#ARMATURE/ANIMATION` and `hero.glb#/ANIMATION` choose where there are several. `fps` is frames per second
-    of an .amc, which does not state it; RequestError with the others, which do. `metres_per_unit` wins over what is
-    found by the size of the body, and over what the file declares. `example:NAME` is a motion that mapctl brings along.
-    FileFormatError names the fault of the file, and where: NaN in place of a number, too, which `load_with_missing`
-    takes.
+    of an .amc or of SMPL parameters that do not state it; RequestError with the others, which do. `metres_per_unit`
+    wins over what is found by the size of the body, and over what the file declares. `example:NAME` is a motion that
+    mapctl brings along. FileFormatError names the fault of the file, and where: NaN in place of a number, too, which
+    `load_with_missing` takes.
     """
     reader, ending = _find_reader(path), ending_of(path)
-    if fps is not None and ending != ".amc":
-        raise RequestError(f"{path}: a {ending} file has a frame rate of its own; only that of an .amc is requested")
+    if fps is not None and ending not in MAY_LACK_RATE:
+        raise RequestError(f"{path}: a {ending} file has a frame rate of its own; leave the requested one out")
     if ending in CHARACTERS:
         from mapctl.formats import character
 
@@ -142,7 +151,7 @@ def _find_reader(path: str | PathLike[str]) -> ModuleType:
     if ending not in READERS:
         asf = "is a skeleton alone: name its motion, a .amc beside it or subject.asf+take.amc"
         pickled = "is a pickle, whose reading runs code: save its poses, trans and mocap_framerate as an .npz"
-        known = {".asf": asf, **dict.fromkeys((".pkl", ".pt", ".pth"), pickled)}
+        known = {".asf": asf, **dict.fromkeys((".pkl", ".pickle", ".npy"), pickled)}
         why = known.get(ending, f"cannot read the ending {ending!r}")
         raise FileFormatError(path, f"{why}; allowed: {', '.join(READERS)}")
     try:
@@ -167,3 +176,7 @@ def check_ending(path: str | PathLike[str]) -> None:
         raise RequestError(f"cannot write {path}: {why}; allowed: {', '.join(WRITERS)}")
     if ending in USD_WRITTEN and find_spec("pxr") is None:
         raise RequestError(f"cannot write {path}: {_NEEDED['pxr']}")
+    if ending == ".fbx":
+        from mapctl.formats import fbx_out
+
+        fbx_out.find_blender()

@@ -1,4 +1,4 @@
-"""FBX in, by the package ufbx: characters and captures, as rigs and as clips. FBX is not written.
+"""FBX in, by the package ufbx: characters and captures, as rigs and as clips.
 
 `find_character` and all below it run in `mapctl.formats.sandbox`, without torch.
 """
@@ -20,6 +20,7 @@ _MAX_ELEMENTS = 2**20
 _BODY_JOINTS = 8
 """Two trees of at least as many joints, below one node and without a common skin, are two characters."""
 _USUAL_RATE = 30.0
+_MODE_119_88 = 18  # of the FBX SDK, which ufbx 0.0.5 reads as 24 frames a second
 _EARLY_SHARE = 0.02  # of a frame by which a take may end before it
 _MOVED = ("Lcl Translation", "Lcl Rotation", "Lcl Scaling")
 _kept: list[object] = []
@@ -282,7 +283,11 @@ def _sample(
 ) -> parts.Poses:
     outer = line_of(armature.nodes[0])[:0:-1]
     rate = scene.settings.frames_per_second
+    if ufbx.find_int(scene.settings.props, "TimeMode", 0) == _MODE_119_88:
+        rate = 120 / 1.001
     rate = rate if np.isfinite(rate) and 0.01 <= rate <= 1e5 else _USUAL_RATE
+    if abs(1.001 * rate - round(1.001 * rate)) < 1e-3:  # 29.97, which is rounded
+        rate = round(1.001 * rate) / 1.001
     if not (np.isfinite(begin) and np.isfinite(end)) or end < begin:
         raise Refusal(f"animation {name!r} lasts from {begin:g} to {end:g} s")
     count = np.floor((end - begin) * rate + _EARLY_SHARE) + 1

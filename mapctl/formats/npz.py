@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mapctl.errors import FileFormatError, MapctlError
+from mapctl.errors import FileFormatError, MapctlError, RequestError
 from mapctl.formats import missing
 from mapctl.formats.atomic import write_bytes
 from mapctl.formats.bvh import as_array, check_finite
@@ -59,15 +59,20 @@ _TRACKS = ("root_position_world", "local_quat_xyzw", "moving_offsets")
 """Keys that change from frame to frame, and may hold NaN where a lossy reading is requested."""
 
 
-def read(path: str | PathLike[str], *, lossy: bool) -> tuple[Motion, MissingValues]:
-    """Read what `save` wrote, or SMPL parameters (`mapctl.formats.smpl`). FileFormatError names the key that is missing
-    or wrong. Some rotations and positions of a `lossy` archive may be NaN."""
-    raw = read_bytes(path)
-    if "poses" in _list_keys(path, raw):
-        from mapctl.formats import smpl  # which reads arrays by this module
+def read(
+    path: str | PathLike[str], *, lossy: bool, fps: Fraction | float | None = None
+) -> tuple[Motion, MissingValues]:
+    """Read what `save` wrote, or SMPL parameters (`mapctl.formats.smpl`), of which `fps` may be the frames per second.
+    FileFormatError names the key that is missing or wrong. Some rotations and positions of a `lossy` archive may be
+    NaN."""
+    from mapctl.formats import smpl  # which reads arrays by this module
 
-        motion = smpl.read(path, read_arrays(path, raw, smpl.NEEDED, smpl.OPTIONAL))
+    raw = read_bytes(path)
+    if not set(smpl.POSES).isdisjoint(_list_keys(path, raw)):
+        motion = smpl.build_motion(path, read_arrays(path, raw, (), smpl.KEYS), fps=fps)
         return motion, MissingValues.none(motion.num_frames, motion.num_joints)
+    if fps is not None:
+        raise RequestError(f"{path}: a motion of mapctl has a frame rate of its own; leave the requested one out")
     arrays = read_arrays(path, raw, tuple(_KEYS), (_LICENCE,))
     _check_shapes(path, arrays, lossy=lossy)
     lost = _replace_missing(path, arrays)

@@ -242,7 +242,7 @@ CASES = {
             "gone.asf+in.amc a.bvh": "gone.asf: no such file",
             "01.asf a.bvh": "01.asf: is a skeleton alone: name its motion, a .amc beside it or subject.asf+take.amc",
             "in.obj a.bvh": "cannot read the ending '.obj'; allowed: .bvh, .npz, .amc",
-            "in.bvh a.fbx": "cannot write a.fbx: .fbx is read but not written; allowed: .bvh, .npz",
+            "in.bvh a.gltf": "cannot write a.gltf: .gltf is read but not written; allowed: .bvh, .npz",
             "in.bvh a.vrm": "a .vrm needs a character",
             "in.bvh a.xyz": "unknown ending '.xyz'",
             "example:run a.bvh": "no example 'run'; there are: noisy-walk",

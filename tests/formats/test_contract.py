@@ -11,7 +11,7 @@ import torch
 from acclaim import pair
 from character_maker import make_character_glb
 from direct_readers import read_directly
-from helpers import random_motion, walk
+from helpers import make_smpl_parameters, random_motion, walk
 
 from mapctl import curves, formats
 from mapctl.errors import FileFormatError, MapctlError, RequestError
@@ -24,7 +24,7 @@ from scenes import scene_file
 
 ROOT = Path(__file__).resolve().parents[2]
 INSTALLED = [e for e in formats.READERS if find_spec({"usd": "pxr", "fbx": "ufbx"}.get(formats.READERS[e], "numpy"))]
-WRITTEN = [e for e in INSTALLED if e in formats.WRITERS and e != ".vrm"]
+WRITTEN = [e for e in INSTALLED if e in formats.WRITERS and e not in (".vrm", ".fbx")]  # whose tests need Blender
 TABLES = {
     "steering.csv": (read_commands, "time_s,speed_mps,heading_deg,look_x,look_y,look_z\n0,1.2,0,,,\n2,1,9,1,1,1\n"),
     "curve.csv": (curves.read, "# drawn by hand\nz;y;x\n0,5;0;1\n1;0;2,5\n"),
@@ -46,7 +46,9 @@ def make(folder: Path, ending: str) -> Path:
         return pair(3).write(folder)
     if ending in (".vrm", ".gltf", ".glb"):
         return make_character_glb(path, names="vrm", animations=("walk",), frames=5, second_skin=True).path
-    if ending == ".fbx":
+    if ending in (".pt", ".pth"):
+        torch.save({"smpl_params_global": make_smpl_parameters(3)}, path)
+    elif ending == ".fbx":
         from fbx_maker import make_fbx
 
         make_fbx(path, frames=3, parts=("shoes",))

@@ -10,6 +10,7 @@ from mapctl import formats
 from mapctl.commands.shared.options import ReadOptions
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
+from mapctl.formats import smpl
 from mapctl.formats.text import warn_once
 from mapctl.motion import Motion
 from mapctl.recording.masks import Mask, masks_from_missing
@@ -60,9 +61,19 @@ def read_rig_clip(text: str, options: ReadOptions | None = None) -> tuple[Motion
     return make_tpose_clip(rig), rig
 
 
-def read_motion(path: Path, rig: Rig | None, *, fps: Fraction | None = None, quiet: bool = False) -> Motion:
-    """Read a motion in metres, by the rig's unit if it has one; `fps` is an .amc's. Print doubts unless `quiet`."""
+def read_motion(
+    path: Path, rig: Rig | None, *, fps: Fraction | None = None, body_model: Path | None = None, quiet: bool = False
+) -> Motion:
+    """Read a motion in metres, by the rig's unit if it has one; `fps` is that of a file that does not state it, and
+    `body_model` gives SMPL parameters their bones. Print doubts unless `quiet`."""
     motion = formats.load(path, fps=fps, metres_per_unit=None if rig is None else rig.metres_per_unit)
+    if body_model is not None:
+        motion = smpl.fit_bones(motion, body_model)
+    elif isinstance(motion.source, smpl.SmplLayout) and not quiet:
+        warn_once(
+            f"{path}: SMPL parameters have no bones and no floor: the canonical body's are taken, and the floor is put"
+            " under the feet; see --smpl-model of mapctl convert"
+        )
     _report_reading(path, motion, rig, quiet=quiet)
     return motion
 
