@@ -39,6 +39,9 @@ class Denoise(ModelCommand, options.RigOptions):
     capture: CaptureKind = "studio"
     """`video`: correct the trajectory so that planted feet neither travel nor leave the floor, for estimates from
     video, whose body drifts and floats. `studio`: the trajectory is as good as the pose."""
+    only_faults: bool = False
+    """Repair only the faults that `mapctl measure` lists, but for noise: all other frames and joints stay to the bit. A
+    foot at fault changes legs and hips from 0.3 s before it to 0.3 s after."""
     causal: bool = False
     """Denoise as for live capture: a frame is decided at most `--delay` after it arrives."""
     delay: options.MaybeNumber = None
@@ -78,17 +81,20 @@ def run(command: Denoise) -> int:
         raise RequestError("--causal has no time for a density; leave --prior out")
     if command.causal and command.capture == "video":
         raise RequestError("--capture video finds the floor from the whole capture; leave it or --causal out")
+    if command.causal and command.only_faults:
+        raise RequestError("--only-faults finds faults in the whole capture; leave it or --causal out")
     if command.causal and command.inbetweener is not None:
         raise RequestError("--causal leaves what is lost to the denoiser; leave --inbetweener out")
     if command.delay is not None and not command.causal:
         raise RequestError("--delay is how far --causal may look ahead; leave it out, or ask for both")
+    settings = DenoiseSettings(capture=command.capture, only_faults=command.only_faults)
     if command.source.is_dir():
-        return _run_folder(command)
+        return _run_folder(command, settings)
     for name, idle in (("cluster", command.cluster is None), ("again", not command.again), ("jobs", command.jobs == 1)):
         if not idle:
             raise RequestError(f"--{name} is for folders; {command.source} is a file")
     results.check_destinations(command.out, command.video, command.report, given=(command.source,))
-    done = _denoise_file(command)
+    done = _denoise_file(command, settings)
     results.write_result("denoise", command, done, done.capture, rig=done.rig)
     if not command.quiet:
         moved, (joint, frame, most) = float(done.correction()[0].mean()), done.find_largest_move()
@@ -100,8 +106,8 @@ def run(command: Denoise) -> int:
     return conclude(done.status, strict=command.strict)
 
 
-def _denoise_file(command: Denoise) -> DenoiseSolution:
-    settings, rig = DenoiseSettings(capture=command.capture), inputs.read_rig(command.rig, command)
+def _denoise_file(command: Denoise, settings: DenoiseSettings) -> DenoiseSolution:
+    rig = inputs.read_rig(command.rig, command)
     named_masks = () if command.mask is None else load_masks(command.mask)
     densities = priors.load_choice(command.prior)
     denoiser = priors.load_denoiser(command.denoiser)
@@ -175,7 +181,7 @@ def _format_densities(done: DenoiseSolution) -> list[str]:
     return lines
 
 
-def _run_folder(command: Denoise) -> int:
+def _run_folder(command: Denoise, settings: DenoiseSettings) -> int:
     """Check, denoise what is not done yet, list what failed."""
     for name in ("mask", "video", "prior", "causal", "strict"):
         if getattr(command, name):
@@ -189,7 +195,9 @@ def _run_folder(command: Denoise) -> int:
     return folders.run_folder(
         command.source,
         command.out,
-        FileDenoiser(command, *names, inputs.read_rig(command.rig, command), dict(weight_sets.find_used_licences())),
+        FileDenoiser(
+            command, settings, *names, inputs.read_rig(command.rig, command), dict(weight_sets.find_used_licences())
+        ),
         label="denoising",
         done="denoised",
         again=command.again,
@@ -204,6 +212,7 @@ class FileDenoiser:
     """Denoiser of the files of a folder, cheap to send to a process, which loads the networks on first use."""
 
     command: Denoise
+    settings: DenoiseSettings
     denoiser: str
     """Name of the denoiser, with its set of weights."""
     inbetweener: str
@@ -221,8 +230,7 @@ class FileDenoiser:
         if not command.quiet:
             inputs.print_doubts(source, motion, self.rig)
         masks, (denoiser, inbetweener) = masks_from_missing(motion, missing), _load(self.denoiser, self.inbetweener)
-        settings = DenoiseSettings(capture=command.capture)
-        done = denoise(motion, denoiser, inbetweener=inbetweener, masks=masks, settings=settings, rig=self.rig)
+        done = denoise(motion, denoiser, inbetweener=inbetweener, masks=masks, settings=self.settings, rig=self.rig)
         own = {str(source): weight_sets.shorten_licence(motion.licence)} if motion.licence else {}
         if command.report is not None:
             path = (command.report / out.relative_to(command.out)).with_suffix(".json")

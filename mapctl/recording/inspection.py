@@ -41,11 +41,14 @@ from mapctl.recording.noise_estimation import (
     estimate_angle_noise,
     estimate_position_noise,
 )
-from mapctl.retarget import RigMap
+from mapctl.retarget import RigMap, to_canonical
+from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL
 
-NOISE_CM = 0.2
-"""Least noise of positions that is listed, centimetres: optical capture has as much."""
+_NOISE_DEG, _NOISE_CM = 0.5, 0.2  # least noise of angles and positions that is listed: optical capture has as much
+MIN_FRAMES = 8
+"""Fewest frames of a recording whose noise can be estimated."""
+_RIG_FRAMES = 3000  # frames from which the rig is identified
 _LOCKED_CHANGE = 1e-6  # of a quaternion, that rounding leaves of a joint which never moves
 
 
@@ -60,10 +63,11 @@ class Artefact:
     stop: int
     """One past the last frame."""
     kind: str
-    """noise, spike, dropout, frozen, slide, float, or stretch: an offset of a bone that varies only by noise."""
+    """noise, spike, dropout, frozen, swap, slide, float, penetration, or stretch: an offset of a bone that varies only
+    by noise."""
     amount: float
-    """Noise's sigma, height of a spike or of a floating toe, distance of a slide, largest error of an offset; 0 for a
-    dropout and frozen frames."""
+    """Noise's sigma, height of a floating toe, depth of penetration, length of a slide, largest error of an offset; of
+    others the largest distance from what the frames around lead to."""
     unit: str
 
 
@@ -142,6 +146,30 @@ def travel(motion: Motion) -> Float[Tensor, "frames 3"]:
     return motion.moving_offsets[joint] if joint else motion.root_position
 
 
+class CorrectedRecording(NamedTuple):
+    """A recording with rigid bones and with limbs on their own sides."""
+
+    motion: Motion
+    rigmap: RigMap
+    """Its rig, identified once: later frames may lack the rig's T-pose."""
+    shares: Float[Tensor, " lead"]
+    """Shares of the motion in the frames of its lead pose (see `estimate_lead_shares`)."""
+    faults: tuple[Artefact, ...]
+    """Stretched bones and swapped limbs."""
+
+
+def correct_structure(
+    motion: Motion, rig: Rig | None = None, hidden: Bool[Tensor, "frames joints"] | None = None
+) -> CorrectedRecording:
+    """Hold bones that stretch by noise, exchange limbs that are swapped, and find the lead pose. Of `hidden` rotations
+    nothing is inferred. RequestError where the joints of the rig cannot be identified."""
+    hidden = torch.zeros(motion.num_frames, motion.num_joints, dtype=torch.bool) if hidden is None else hidden
+    motion, stretched = hold_rigid_bones(motion) if motion.num_frames >= MIN_FRAMES else (motion, [])
+    beginning, rigmap = to_canonical(motion.slice(0, min(motion.num_frames, _RIG_FRAMES)), rig)
+    motion, swapped = exchange_swapped_limbs(motion, rigmap, hidden)
+    return CorrectedRecording(motion, rigmap, estimate_lead_shares(beginning), (*stretched, *swapped))
+
+
 def inspect_recording(motion: Motion, masks: Sequence[Mask] = ()) -> Inspection:
     """Inspect a recording on any rig; RequestError for masks that name joints or frames it has not."""
     quats, position = choose_continuous_signs(motion.local_quat_xyzw), travel(motion)
@@ -154,6 +182,25 @@ def inspect_recording(motion: Motion, masks: Sequence[Mask] = ()) -> Inspection:
     noise = estimate_angle_noise(quats, ~(dropouts | spikes))
     noise_root = estimate_position_noise(position, ~(dropouts_root | spikes_root))
     return Inspection(motion, spikes, dropouts, spikes_root, dropouts_root, frozen, noise, noise_root)
+
+
+def list_value_artefacts(inspection: Inspection) -> list[Artefact]:
+    """List noise, spikes, drop-outs and frozen frames, each by how far it is from what the frames around lead to."""
+    motion, repaired, names = inspection.motion, inspection.repaired(), inspection.motion.skeleton.names
+    turned = torch.rad2deg(rotations.turns_between(motion.local_quat_xyzw, repaired.local_quat_xyzw).norm(dim=-1))
+    moved = 100 * (travel(repaired) - travel(motion)).norm(dim=-1, keepdim=True)
+    travelling, frozen = [names[motion.travelling_joint]], inspection.frozen[:, None]
+    noise = [*zip(names, torch.rad2deg(inspection.noise).tolist(), strict=True)]
+    found = [
+        Artefact(name, 0, motion.num_frames, "noise", sigma, "deg") for name, sigma in noise if sigma >= _NOISE_DEG
+    ]
+    if 100 * inspection.noise_root >= _NOISE_CM:
+        found.append(Artefact(travelling[0], 0, motion.num_frames, "noise", 100 * inspection.noise_root, "cm"))
+    found += list_artefacts(names, inspection.spikes, "spike", "deg", turned)
+    found += list_artefacts(travelling, inspection.spikes_root[:, None], "spike", "cm", moved)
+    found += list_artefacts([ALL], frozen, "frozen", "deg", turned.amax(dim=1, keepdim=True))
+    found += list_artefacts(names, inspection.dropouts & ~frozen, "dropout", "deg", turned)
+    return found + list_artefacts(travelling, inspection.dropouts_root[:, None] & ~frozen, "dropout", "cm", moved)
 
 
 def find_gaps(motion: Motion) -> tuple[Mask, ...]:
@@ -491,7 +538,7 @@ def hold_rigid_bones(motion: Motion) -> tuple[Motion, list[Artefact]]:
             moving[joint] = held.expand_as(track)
             amount = 100 * float((track - held).norm(dim=-1).max())
             faults.append(Artefact(motion.skeleton.names[joint], 0, motion.num_frames, "stretch", amount, "cm"))
-    return replace(motion, moving_offsets=moving), [fault for fault in faults if fault.amount >= NOISE_CM]
+    return replace(motion, moving_offsets=moving), [fault for fault in faults if fault.amount >= _NOISE_CM]
 
 
 def _find_rigid_offset(track: Float[Tensor, "frames 3"], fps: float) -> Float[Tensor, "3"] | None:
