@@ -17,10 +17,11 @@ from controllers.denoising.solution import DenoiseSolution
 from mapctl.editing.rigged_motion import place_ankles
 from mapctl.metrics.faults import Footing, list_faults
 from mapctl.motion import Motion
-from mapctl.numerics.intervals import widen
+from mapctl.numerics.easing import smootherstep
+from mapctl.numerics.intervals import count_frames_to_observed, widen
 from mapctl.numerics.smooth_offsets import blend_seams_in_positions, blend_seams_in_rotations, interpolate_offsets
 from mapctl.problem.solution import Outcome, Status
-from mapctl.recording.inspection import Artefact
+from mapctl.recording.inspection import Artefact, travel
 from mapctl.recording.masks import ROOT, Mask, MissingMask, expand_masks, restore_observed
 from mapctl.retarget.rigs import Rig
 
@@ -40,7 +41,8 @@ def keep_all_but_faults(done: DenoiseSolution, exchanged: Motion) -> DenoiseSolu
     false = replace(false, joints=false.joints | (exchanged.local_quat_xyzw != capture.local_quat_xyzw).any(dim=-1))
     motion = _plant_feet(_fill(capture, done.motion, false), done.rig)
     left = [fault for fault in list_faults(motion, done.rig) if fault.kind not in _WHOLE]
-    changed = (motion.local_quat_xyzw != capture.local_quat_xyzw).any(dim=-1).any(dim=-1)
+    changed = (motion.local_quat_xyzw != capture.local_quat_xyzw).flatten(1).any(dim=1)
+    changed |= (travel(motion) != travel(capture)).any(dim=1)
     notes = [f"only faults are repaired: {int(changed.sum())} of {len(changed)} frames are changed"]
     if any(fault.kind in _WHOLE for fault in done.faults):
         notes.append("noise and stretched bones are in all frames: they stay")
@@ -76,61 +78,73 @@ def _fill(capture: Motion, clean: Motion, false: MissingMask) -> Motion:
 
 
 def _plant_feet(motion: Motion, rig: Rig | None) -> Motion:
-    """Hold the feet that slide, float or penetrate; faults that stay faults nevertheless are left as they are."""
+    """Hold the feet that slide, float or penetrate. Left as they are: slides of a toe that stands on both sides of it,
+    at two positions, and faults that stay faults or whose repair is less smooth than all of the motion."""
     footing = Footing.of(motion, rig)
-    faults = footing.list_artefacts()
+    faults = [fault for fault in footing.list_artefacts() if fault.kind != "slide" or not all(_stands(footing, fault))]
+    roughest, fade = float(_measure_roughness(motion).max()), round(FADE_SECONDS * float(motion.fps))
     while faults:
         planted = _hold_toes(motion, footing, faults)
-        still = Footing.of(planted, rig).list_artefacts()
-        repaired = [fault for fault in faults if not any(_overlap(fault, other) for other in still)]
-        if len(repaired) == len(faults):
+        rough, still = _measure_roughness(planted) > roughest, Footing.of(planted, rig).list_artefacts()
+        kept = []
+        for fault in faults:
+            start, stop = max(0, fault.start - fade), fault.stop + fade
+            again = any(one.joint == fault.joint and one.start < stop and start < one.stop for one in still)
+            kept += [] if again or bool(rough[start:stop].any()) else [fault]
+        if len(kept) == len(faults):
             return planted
-        faults = repaired
+        faults = kept
     return motion
 
 
-def _overlap(one: Artefact, other: Artefact) -> bool:
-    return one.joint == other.joint and one.start < other.stop and other.start < one.stop
+def _measure_roughness(motion: Motion) -> Float[Tensor, " frames"]:
+    """Measure the largest third difference of any joint about each frame, metres."""
+    return motion.joint_positions().diff(n=3, dim=0, prepend=motion.joint_positions()[:3]).norm(dim=-1).amax(dim=-1)
+
+
+def _stands(footing: Footing, fault: Artefact) -> tuple[bool, bool]:
+    """Return whether a toe that slides stands before and after it."""
+    planted = footing.planted[:, footing.names.index(fault.joint)]
+    beside = max(1, round(_STANDS_SECONDS * float(footing.rigged.motion.fps)))
+    before, after = planted[max(0, fault.start - beside) : fault.start], planted[fault.stop : fault.stop + beside]
+    return len(before) > 0 and bool(before.all()), len(after) > 0 and bool(after.all())
 
 
 def _hold_toes(motion: Motion, footing: Footing, faults: Sequence[Artefact]) -> Motion:
+    """Bring toes to where they stand, and in height to their supports, by hips and legs."""
     rigged, toes, fps = footing.rigged, footing.toes, float(motion.fps)
-    offsets, held = torch.zeros_like(toes), torch.zeros_like(footing.planted)
+    offsets, slides = torch.zeros_like(toes), torch.zeros_like(footing.planted)
+    near, off_floor = torch.zeros(2, motion.num_frames, dtype=torch.bool)
     for fault in faults:
+        near[fault.start : fault.stop] = True
+        if fault.kind != "slide":
+            off_floor[fault.start : fault.stop] = True
+            continue
         foot, span = footing.names.index(fault.joint), slice(fault.start, fault.stop)
-        if fault.kind == "slide":
-            offsets[span, foot, ::2] = (_find_stand(footing, fault, foot) - toes[span, foot])[:, ::2]
-        else:
-            offsets[span, foot, 1] = (footing.supports - toes[..., 1])[span, foot]
-        held[span, foot] = True
-    near = widen(held.any(dim=1), round(FADE_SECONDS * fps))
+        before, after = _stands(footing, fault)
+        own = toes[span, foot]
+        stand = own[0] if before else own[-1] if after else own.mean(dim=0)
+        offsets[span, foot, ::2] = (stand - own)[:, ::2]
+        slides[span, foot] = True
+    held = footing.firm & widen(off_floor, round(FADE_SECONDS / 2 * fps))[:, None]
+    offsets[..., 1] = torch.where(held, footing.supports - toes[..., 1], 0.0)
+    away = count_frames_to_observed(near[None])[0].amin(dim=-1, keepdim=True).double()
+    share = smootherstep(1 - away / (FADE_SECONDS * fps))
 
     def interpolate(values: Tensor, known: Tensor) -> Tensor:
-        return interpolate_offsets(values, known | ~near, seconds=FADE_SECONDS, fps=fps)
+        return share * interpolate_offsets(values, known, seconds=FADE_SECONDS, fps=fps)
 
-    # Hips go up or down by as much as all feet that bear the body ask for.
-    rise = torch.where(footing.bearing, offsets[..., 1], torch.inf).amin(dim=1).clamp_min(0)
-    fall = torch.where(footing.bearing, offsets[..., 1], -torch.inf).amax(dim=1).clamp_max(0)
-    firm = held.any(dim=1)
-    shared = torch.where(firm, rise + fall, 0.0)
+    # Hips go up or down by the mean of what the feet ask for, and legs do the rest.
     shift = torch.zeros_like(toes[:, 0])
-    shift[:, 1:2] = interpolate(shared[:, None], firm)
+    mean = offsets[..., 1].sum(dim=1) / held.sum(dim=1).clamp_min(1)
+    shift[:, 1:2] = interpolate(mean[:, None], held.any(dim=1))
     rigged = rigged.with_motion(rigged.shift_hips(shift))
-    offsets = torch.where(footing.bearing[..., None], offsets - shift[:, None], 0.0)
-    ankles = [interpolate(offsets[:, foot], footing.bearing[:, foot]) for foot in range(2)]
-    planted = place_ankles(rigged, rigged.positions("Foot") + torch.stack(ankles, dim=1))
-    legs = torch.zeros(motion.num_joints, dtype=torch.bool)
-    legs[[rigged.rigmap.joints[leg] for leg in _LEGS]] = True
-    return restore_observed(
-        rigged.with_motion(planted).in_file_world(motion), motion, MissingMask(near[:, None] & legs, near)
-    )
-
-
-def _find_stand(footing: Footing, fault: Artefact, foot: int) -> Float[Tensor, "3"]:
-    """Find where a sliding toe is held: where it stands before the slide or after it, else at the middle of it."""
-    toes, beside = footing.toes[:, foot], max(1, round(_STANDS_SECONDS * float(footing.rigged.motion.fps)))
-    if footing.planted[max(0, fault.start - beside) : fault.start, foot].all():
-        return toes[fault.start]
-    if footing.planted[fault.stop : fault.stop + beside, foot].all():
-        return toes[fault.stop - 1]
-    return toes[fault.start : fault.stop].mean(dim=0)
+    offsets[..., 1] -= torch.where(held, shift[:, 1:2], 0.0)
+    ankles = rigged.positions("Foot")
+    for foot in range(2):
+        ankles[:, foot, ::2] += interpolate(offsets[:, foot, ::2], slides[:, foot])
+        ankles[:, foot, 1:2] += interpolate(offsets[:, foot, 1:2], held[:, foot])
+    planted = rigged.with_motion(place_ankles(rigged, ankles)).in_file_world(motion)
+    changed = MissingMask(torch.zeros(motion.num_frames, motion.num_joints, dtype=torch.bool), share[:, 0] > 0)
+    changed.joints[:, [rigged.rigmap.joints[leg] for leg in _LEGS]] = share > 0
+    return restore_observed(planted, motion, changed)

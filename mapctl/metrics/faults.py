@@ -4,7 +4,6 @@ A toe bears the body where it is planted, and also where neither is, near its su
 slides as a whole. Steps of planted toes in captures are short or slow; what lasts and is fast is a slide.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -46,8 +45,11 @@ def list_faults(motion: Motion, rig: Rig | None = None) -> list[Artefact]:
 
 
 def list_inspected_faults(inspection: Inspection, rig: Rig | None) -> list[Artefact]:
-    """List the faults of an inspected recording; feet are judged with its false values filled in."""
-    return [*list_value_artefacts(inspection), *Footing.of(inspection.repaired(), rig).list_artefacts()]
+    """List the faults of an inspected recording; feet are judged with its false values filled in, but not where the
+    body's position is false."""
+    feet = Footing.of(inspection.repaired(), rig).list_artefacts()
+    known = [fault for fault in feet if not inspection.dropouts_root[fault.start : fault.stop].any()]
+    return [*list_value_artefacts(inspection), *known]
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +62,8 @@ class Footing:
     planted: Bool[Tensor, "frames 2"]
     bearing: Bool[Tensor, "frames 2"]
     """Whether a toe is planted, or would have to be."""
+    firm: Bool[Tensor, "frames 2"]
+    """Whether a toe is planted, but for the ends of contacts, in which it is on its way down or up."""
     supports: Float[Tensor, "frames 2"]
     """Height at which each toe rests, metres."""
 
@@ -73,7 +77,10 @@ class Footing:
         supports, up = fit_supports(toes, planted), hips[:, None] - toes
         near = (toes[..., 1] - supports).abs() < _NEAR
         below = torch.atan2(up[..., ::2].norm(dim=-1), up[..., 1]) < _BELOW
-        return Footing(rigged, toes, planted, planted | (~planted.any(dim=1, keepdim=True) & near & below), supports)
+        edge = max(1, round(_EDGE_SECONDS * fps))
+        firm = torch.stack([~widen(~foot, edge) for foot in planted.unbind(dim=1)], dim=1)
+        bearing = planted | (~planted.any(dim=1, keepdim=True) & near & below)
+        return Footing(rigged, toes, planted, bearing, firm, supports)
 
     @property
     def names(self) -> list[str]:
@@ -81,27 +88,16 @@ class Footing:
         return [self.rigged.rigmap.joint_names.get(toe, toe) for toe in TOES]
 
     def list_artefacts(self) -> list[Artefact]:
-        """List toes that bear the body and slide, and planted toes that float over or are under their support."""
-        fps = float(self.rigged.motion.fps)
-        return list_foot_artefacts(self.names, self.toes, self.planted, self.bearing, self.supports, fps)
-
-
-def list_foot_artefacts(
-    names: Sequence[str],
-    toes: Float[Tensor, "frames 2 3"],
-    planted: Bool[Tensor, "frames 2"],
-    bearing: Bool[Tensor, "frames 2"],
-    supports: Float[Tensor, "frames 2"],
-    fps: float,
-) -> list[Artefact]:
-    """List slides by their length, floating and penetration by the largest height and depth; lengths in metres."""
-    ahead, behind = (torch.cat(each) for each in ((toes[1:], toes[-1:]), (toes[:1], toes[:-1])))
-    steps, height = (ahead - behind)[..., ::2].norm(dim=-1) / 2, toes[..., 1] - supports
-    edge = max(1, round(_EDGE_SECONDS * fps))
-    firm = torch.stack([~widen(~foot, edge) for foot in planted.unbind(dim=1)], dim=1)
-    slides = bearing & (steps * fps > _SLIDE_SPEED)
-    found = list_artefacts(names, slides, "slide", "cm", steps, total=lambda part: 100 * part.sum())
-    found = [fault for fault in found if fault.stop - fault.start >= _SLIDE_SECONDS * fps]
-    off = list_artefacts(names, firm & (height > _OFF_FLOOR), "float", "cm", 100 * height)
-    off += list_artefacts(names, firm & (height < -_OFF_FLOOR), "penetration", "cm", -100 * height)
-    return found + [fault for fault in off if fault.stop - fault.start >= _OFF_SECONDS * fps]
+        """List slides of toes that bear the body, by their length, and firmly planted toes that float over or penetrate
+        their support, by the largest height or depth."""
+        names, fps, toes = self.names, float(self.rigged.motion.fps), self.toes
+        ahead, behind = (torch.cat(each) for each in ((toes[1:], toes[-1:]), (toes[:1], toes[:-1])))
+        steps, height = (ahead - behind)[..., ::2].norm(dim=-1) / 2, toes[..., 1] - self.supports
+        slides = self.bearing & (steps * fps > _SLIDE_SPEED)
+        found = list_artefacts(names, slides, "slide", "cm", steps, total=lambda part: 100 * part.sum())
+        found = [fault for fault in found if fault.stop - fault.start >= _SLIDE_SECONDS * fps]
+        # Beside a foot that stands the other may be put on anything.
+        stands = (self.planted & (height <= _OFF_FLOOR)).any(dim=1, keepdim=True)
+        off = list_artefacts(names, self.firm & (height > _OFF_FLOOR) & ~stands, "float", "cm", 100 * height)
+        off += list_artefacts(names, self.firm & (height < -_OFF_FLOOR), "penetration", "cm", -100 * height)
+        return found + [fault for fault in off if fault.stop - fault.start >= _OFF_SECONDS * fps]
