@@ -69,6 +69,10 @@ class Denoise(ModelCommand, options.RigOptions):
     the frames."""
     quiet: options.Quiet = False
 
+    @property
+    def settings(self) -> DenoiseSettings:
+        return DenoiseSettings(capture=self.capture, only_faults=self.only_faults)
+
 
 _MAX_NAMED = 6
 _LOW_SHARE = 0.5  # share of the frames with the proposal as it is below which a joint is named
@@ -83,18 +87,19 @@ def run(command: Denoise) -> int:
         raise RequestError("--capture video finds the floor from the whole capture; leave it or --causal out")
     if command.causal and command.only_faults:
         raise RequestError("--only-faults finds faults in the whole capture; leave it or --causal out")
+    if command.only_faults and command.capture == "video":
+        raise RequestError("--only-faults leaves the trajectory that --capture video corrects; leave one of them out")
     if command.causal and command.inbetweener is not None:
         raise RequestError("--causal leaves what is lost to the denoiser; leave --inbetweener out")
     if command.delay is not None and not command.causal:
         raise RequestError("--delay is how far --causal may look ahead; leave it out, or ask for both")
-    settings = DenoiseSettings(capture=command.capture, only_faults=command.only_faults)
     if command.source.is_dir():
-        return _run_folder(command, settings)
+        return _run_folder(command)
     for name, idle in (("cluster", command.cluster is None), ("again", not command.again), ("jobs", command.jobs == 1)):
         if not idle:
             raise RequestError(f"--{name} is for folders; {command.source} is a file")
     results.check_destinations(command.out, command.video, command.report, given=(command.source,))
-    done = _denoise_file(command, settings)
+    done = _denoise_file(command)
     results.write_result("denoise", command, done, done.capture, rig=done.rig)
     if not command.quiet:
         moved, (joint, frame, most) = float(done.correction()[0].mean()), done.find_largest_move()
@@ -106,7 +111,7 @@ def run(command: Denoise) -> int:
     return conclude(done.status, strict=command.strict)
 
 
-def _denoise_file(command: Denoise, settings: DenoiseSettings) -> DenoiseSolution:
+def _denoise_file(command: Denoise) -> DenoiseSolution:
     rig = inputs.read_rig(command.rig, command)
     named_masks = () if command.mask is None else load_masks(command.mask)
     densities = priors.load_choice(command.prior)
@@ -117,14 +122,14 @@ def _denoise_file(command: Denoise, settings: DenoiseSettings) -> DenoiseSolutio
         if command.causal:
             delay = _DEFAULT_DELAY if command.delay is None else command.delay
             return denoise_causal(
-                motion, denoiser, masks=masks, settings=settings, delay=delay, rig=rig, progress=progress
+                motion, denoiser, masks=masks, settings=command.settings, delay=delay, rig=rig, progress=progress
             )
         return denoise(
             motion,
             denoiser,
             inbetweener=priors.load_inbetweener(command.inbetweener or "transformer"),
             masks=masks,
-            settings=settings,
+            settings=command.settings,
             densities=densities,
             rig=rig,
             progress=progress,
@@ -181,7 +186,7 @@ def _format_densities(done: DenoiseSolution) -> list[str]:
     return lines
 
 
-def _run_folder(command: Denoise, settings: DenoiseSettings) -> int:
+def _run_folder(command: Denoise) -> int:
     """Check, denoise what is not done yet, list what failed."""
     for name in ("mask", "video", "prior", "causal", "strict"):
         if getattr(command, name):
@@ -195,9 +200,7 @@ def _run_folder(command: Denoise, settings: DenoiseSettings) -> int:
     return folders.run_folder(
         command.source,
         command.out,
-        FileDenoiser(
-            command, settings, *names, inputs.read_rig(command.rig, command), dict(weight_sets.find_used_licences())
-        ),
+        FileDenoiser(command, *names, inputs.read_rig(command.rig, command), dict(weight_sets.find_used_licences())),
         label="denoising",
         done="denoised",
         again=command.again,
@@ -212,7 +215,6 @@ class FileDenoiser:
     """Denoiser of the files of a folder, cheap to send to a process, which loads the networks on first use."""
 
     command: Denoise
-    settings: DenoiseSettings
     denoiser: str
     """Name of the denoiser, with its set of weights."""
     inbetweener: str
@@ -230,7 +232,7 @@ class FileDenoiser:
         if not command.quiet:
             inputs.print_doubts(source, motion, self.rig)
         masks, (denoiser, inbetweener) = masks_from_missing(motion, missing), _load(self.denoiser, self.inbetweener)
-        done = denoise(motion, denoiser, inbetweener=inbetweener, masks=masks, settings=self.settings, rig=self.rig)
+        done = denoise(motion, denoiser, inbetweener=inbetweener, masks=masks, settings=command.settings, rig=self.rig)
         own = {str(source): weight_sets.shorten_licence(motion.licence)} if motion.licence else {}
         if command.report is not None:
             path = (command.report / out.relative_to(command.out)).with_suffix(".json")

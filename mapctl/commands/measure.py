@@ -237,24 +237,27 @@ def _describe_cycle(cycle: Mapping[str, Any]) -> str:
     return f"{about}; {cycle['steps_per_minute']:.0f} steps a minute, stride {cycle['stride_m']:.2f} m"
 
 
+_FAULT_COLUMNS = {
+    "kind": "fault",
+    "joint": "joint",
+    "start": "from frame",
+    "stop": "to",
+    "start_s": "from s",
+    "stop_s": "to s",
+    "amount": "size",
+    "unit": "",
+}
+
+
 def _print_faults(faults: Sequence[Mapping[str, Any]]) -> None:
+    """Print the worst faults, and noise, which is in all frames, in a line."""
     noisy = [f"{fault['joint']} {fault['amount']:.1f} {fault['unit']}" for fault in faults if fault["kind"] == "noise"]
     if noisy:
         print(f"noise in all frames: {noisy[0]}" + (f", {len(noisy) - 1} more joints less" if len(noisy) > 1 else ""))
-    rows = [
-        [
-            fault["kind"],
-            fault["joint"],
-            f"{fault['start']}:{fault['stop']}",
-            f"{fault['start_s']:.2f}:{fault['stop_s']:.2f}",
-            f"{fault['amount']:.1f} {fault['unit']}",
-        ]
-        for fault in faults
-        if fault["kind"] != "noise"
-    ]
+    rows = [[fault[key] for key in _FAULT_COLUMNS] for fault in faults if fault["kind"] != "noise"]
     if rows:
-        outputs.print_table(["fault", "joint", "frames", "seconds", "size"], rows[:_MAX_LINES])
-    rest = f", of which {len(rows) - _MAX_LINES} more are in --json" if len(rows) > _MAX_LINES else ""
+        outputs.print_table([*_FAULT_COLUMNS.values()], rows[:_MAX_LINES])
+    rest = f", of which --json lists {len(rows) - _MAX_LINES} more" if len(rows) > _MAX_LINES else ""
     print(f"faults: {len(rows) or 'none'}{rest}")
 
 

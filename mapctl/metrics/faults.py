@@ -38,9 +38,11 @@ _NEAR, _BELOW = 0.02, 0.5  # metres from its support, and radians from the verti
 def list_faults(motion: Motion, rig: Rig | None = None) -> list[Artefact]:
     """List the faults of a motion, the worst first: a degree counts as a centimetre, which it is 57 cm from the joint.
     `rig` wins over what would be recognised; RequestError where the rig's joints cannot be identified."""
-    corrected, lead = (found := correct_structure(motion, rig)).motion, len(found.shares)
-    own = list_inspected_faults(inspect_recording(corrected.slice(lead, motion.num_frames)), as_rig(found.rigmap))
-    faults = [*found.faults, *(replace(fault, start=fault.start + lead, stop=fault.stop + lead) for fault in own)]
+    hidden = torch.zeros(motion.num_frames, motion.num_joints, dtype=torch.bool)
+    whole, rigmap, shares, faults = correct_structure(motion, rig, hidden)
+    lead = len(shares)
+    for fault in list_inspected_faults(inspect_recording(whole.slice(lead, whole.num_frames)), as_rig(rigmap)):
+        faults.append(replace(fault, start=fault.start + lead, stop=fault.stop + lead))
     return sorted(faults, key=lambda fault: -fault.amount)
 
 

@@ -146,28 +146,18 @@ def travel(motion: Motion) -> Float[Tensor, "frames 3"]:
     return motion.moving_offsets[joint] if joint else motion.root_position
 
 
-class CorrectedRecording(NamedTuple):
-    """A recording with rigid bones and with limbs on their own sides."""
-
-    motion: Motion
-    rigmap: RigMap
-    """Its rig, identified once: later frames may lack the rig's T-pose."""
-    shares: Float[Tensor, " lead"]
-    """Shares of the motion in the frames of its lead pose (see `estimate_lead_shares`)."""
-    faults: tuple[Artefact, ...]
-    """Stretched bones and swapped limbs."""
-
-
 def correct_structure(
-    motion: Motion, rig: Rig | None = None, hidden: Bool[Tensor, "frames joints"] | None = None
-) -> CorrectedRecording:
-    """Hold bones that stretch by noise, exchange limbs that are swapped, and find the lead pose. Of `hidden` rotations
-    nothing is inferred. RequestError where the joints of the rig cannot be identified."""
-    hidden = torch.zeros(motion.num_frames, motion.num_joints, dtype=torch.bool) if hidden is None else hidden
+    motion: Motion, rig: Rig | None, hidden: Bool[Tensor, "frames joints"]
+) -> tuple[Motion, RigMap, Float[Tensor, " lead"], list[Artefact]]:
+    """Hold bones that stretch by noise and exchange swapped limbs; also return the rig, identified once, since later
+    frames may lack its T-pose, the shares of the lead pose (see `estimate_lead_shares`), and the faults.
+
+    Of `hidden` rotations nothing is inferred. RequestError where the rig's joints cannot be identified.
+    """
     motion, stretched = hold_rigid_bones(motion) if motion.num_frames >= MIN_FRAMES else (motion, [])
     beginning, rigmap = to_canonical(motion.slice(0, min(motion.num_frames, _RIG_FRAMES)), rig)
     motion, swapped = exchange_swapped_limbs(motion, rigmap, hidden)
-    return CorrectedRecording(motion, rigmap, estimate_lead_shares(beginning), (*stretched, *swapped))
+    return motion, rigmap, estimate_lead_shares(beginning), [*stretched, *swapped]
 
 
 def inspect_recording(motion: Motion, masks: Sequence[Mask] = ()) -> Inspection:
