@@ -40,7 +40,9 @@ def keep_all_but_faults(done: DenoiseSolution, exchanged: Motion) -> DenoiseSolu
     false = expand_masks(capture, [_to_mask(fault) for fault in done.faults if fault.kind in _FALSE])
     false = replace(false, joints=false.joints | (exchanged.local_quat_xyzw != capture.local_quat_xyzw).any(dim=-1))
     motion = _plant_feet(_fill(capture, done.motion, false), done.rig)
-    left = [fault for fault in list_faults(motion, done.rig) if fault.kind not in _WHOLE]
+    # What is filled in may be smooth: only what was smoothed before is named.
+    left = [fault for fault in list_faults(motion, done.rig) if fault.kind not in (*_WHOLE, "smoothed")]
+    left += [fault for fault in done.faults if fault.kind == "smoothed"]
     changed = (motion.local_quat_xyzw != capture.local_quat_xyzw).flatten(1).any(dim=1)
     changed |= (travel(motion) != travel(capture)).any(dim=1)
     notes = [f"only faults are repaired: {int(changed.sum())} of {len(changed)} frames are changed"]

@@ -40,8 +40,8 @@ class Denoise(ModelCommand, options.RigOptions):
     """`video`: correct the trajectory so that planted feet neither travel nor leave the floor, for estimates from
     video, whose body drifts and floats. `studio`: the trajectory is as good as the pose."""
     only_faults: bool = False
-    """Repair only the faults that `mapctl measure` lists, but for noise: all other frames and joints stay to the bit. A
-    foot at fault changes legs and hips from 0.3 s before it to 0.3 s after."""
+    """Repair only the faults that `mapctl measure` lists, but for noise and smoothing: all other frames and joints stay
+    to the bit. A foot at fault changes legs and hips from 0.3 s before it to 0.3 s after."""
     causal: bool = False
     """Denoise as for live capture: a frame is decided at most `--delay` after it arrives."""
     delay: options.MaybeNumber = None

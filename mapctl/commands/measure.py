@@ -26,8 +26,8 @@ class Measure(ModelCommand, options.RigOptions):
     """Path, feet, jitter and more of a motion, beside a reference clip and mocap's own values.
 
     Of a clip also its cycle, of a walk or a run one stride, or that it has none; and its faults, the worst first:
-    spikes, frozen frames, drop-outs, noise, and feet that slide, float or penetrate the floor (`mapctl denoise
-    --only-faults` repairs them).
+    spikes, frozen frames, drop-outs, noise, smoothed spans, and feet that slide, float or penetrate the floor (`mapctl
+    denoise --only-faults` repairs them, but for noise and smoothing).
     All are measured as mocap's values were: on canonical joints with Y up, at 30 frames a second if there are more. Of
     a folder the means and the largest values over its clips; beside a folder of mocap also how well a classifier
     separates the two. Clips of a folder that cannot be measured are left out and listed.

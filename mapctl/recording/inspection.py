@@ -33,7 +33,7 @@ from torch import Tensor
 from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
-from mapctl.numerics.intervals import fill_missing, last_observed, true_intervals
+from mapctl.numerics.intervals import fill_missing, last_observed, true_intervals, widen
 from mapctl.recording.masks import ALL, ROOT, Mask, expand_valid_masks
 from mapctl.recording.noise_estimation import (
     RESOLUTION,
@@ -63,11 +63,11 @@ class Artefact:
     stop: int
     """One past the last frame."""
     kind: str
-    """noise, spike, dropout, frozen, swap, slide, float, penetration, or stretch: an offset of a bone that varies only
-    by noise."""
+    """noise, spike, dropout, frozen, swap, smoothed, slide, float, penetration, or stretch: an offset of a bone that
+    varies only by noise."""
     amount: float
-    """Noise's sigma, height of a floating toe, depth of penetration, length of a slide, largest error of an offset; of
-    others the largest distance from what the frames around lead to."""
+    """Noise's sigma, height of a floating toe, depth of penetration, length of a slide, largest error of an offset,
+    loss of detail; of others the largest distance from what the frames around lead to."""
     unit: str
 
 
@@ -190,7 +190,42 @@ def list_value_artefacts(inspection: Inspection) -> list[Artefact]:
     found += list_artefacts(travelling, inspection.spikes_root[:, None], "spike", "cm", moved)
     found += list_artefacts([ALL], frozen, "frozen", "deg", turned.amax(dim=1, keepdim=True))
     found += list_artefacts(names, inspection.dropouts & ~frozen, "dropout", "deg", turned)
-    return found + list_artefacts(travelling, inspection.dropouts_root[:, None] & ~frozen, "dropout", "cm", moved)
+    found += list_artefacts(travelling, inspection.dropouts_root[:, None] & ~frozen, "dropout", "cm", moved)
+    return found + list_smoothed(motion)
+
+
+_SMOOTH_SECONDS, _SMOOTH_DB = 0.6, 13.0  # of a window, and by how much weaker its detail is than at that speed
+_STEP_SECONDS, _LEAST_TURN = 1 / 30, 0.003  # of a difference, and radians in that time of a joint that moves
+
+
+def list_smoothed(motion: Motion) -> list[Artefact]:
+    """List spans in which the whole body was smoothed: detail, the fourth differences of joints' turns, is weaker than
+    the clip has at that speed, in the median of the joints that move. One joint alone does not show it."""
+    fps, quats = float(motion.fps), motion.local_quat_xyzw
+    step, side = max(1, round(_STEP_SECONDS * fps)), round(_SMOOTH_SECONDS * fps / 2)
+    if motion.num_frames < 8 * side + 5 * step:
+        return []
+    turns = detail = rotations.turns_between(quats[:-step], quats[step:])
+    for _ in range(4):
+        detail = detail[step:] - detail[:-step]
+
+    def measure_level(values: Float[Tensor, "frames joints 3"]) -> Float[Tensor, "joints frames"]:
+        power = values.square().sum(dim=-1).T[None]
+        mean = torch.nn.functional.avg_pool1d(power, 2 * side + 1, 1, side, count_include_pad=False)
+        return 10 * (mean[0] + 1e-16).log10()
+
+    speed, level = measure_level(turns[2 * step :][: len(detail)]), measure_level(detail)
+    moves = speed > 20 * math.log10(_LEAST_TURN)
+    usual = moves.double().mean(dim=1) > 0.5
+    if not usual.any():
+        return []
+    speed, level, moves = speed[usual], level[usual], moves[usual]
+    away = speed - speed.mean(dim=1, keepdim=True)
+    slope = (away * level).sum(dim=1, keepdim=True) / away.square().sum(dim=1, keepdim=True).clamp_min(1e-6)
+    weaker = torch.where(moves, level.mean(dim=1, keepdim=True) + slope * away - level, 0.0).median(dim=0).values
+    before = (motion.num_frames - len(weaker)) // 2
+    spans = list_artefacts([ALL], widen(weaker > _SMOOTH_DB, side)[:, None], "smoothed", "dB", weaker[:, None])
+    return [replace(span, start=span.start + before, stop=span.stop + before) for span in spans]
 
 
 def find_gaps(motion: Motion) -> tuple[Mask, ...]:

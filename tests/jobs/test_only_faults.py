@@ -8,6 +8,7 @@ import torch
 from captures import error_cm, swaying
 from helpers import quat_xyzw, run
 from performers import Performer
+from scipy.ndimage import gaussian_filter1d
 from tiny_denoiser import QUICK, save_tiny_denoiser, tiny_denoiser
 
 import mapctl
@@ -162,6 +163,22 @@ def test_noise_stays_and_is_named(truth):
     assert any("noise" in note for note in done.notes)
     same = (done.motion.local_quat_xyzw == quats).all(dim=-1).double().mean()
     assert same > 0.9
+
+
+def test_a_smoothed_span_of_a_capture_is_listed_and_named(truth):
+    """Trembling by 0.1 degrees, as in captures, is smoothed away for a second."""
+    shake = 0.002 * torch.randn(FRAMES, 21, 3, generator=torch.Generator().manual_seed(0)).double()
+    quats = rotations.multiply(truth.local_quat_xyzw, quat_xyzw(shake))
+    given = replace(truth, local_quat_xyzw=quats)
+    assert "smoothed" not in {fault.kind for fault in list_faults(given)}
+    smooth = torch.from_numpy(gaussian_filter1d(quats.numpy(), 3, axis=0))
+    quats = torch.cat([quats[:80], torch.nn.functional.normalize(smooth[80:120], dim=-1), quats[120:]])
+    done = denoise(replace(given, local_quat_xyzw=quats), tiny_denoiser(), settings=SETTINGS)
+    (fault,) = [fault for fault in done.faults if fault.kind == "smoothed"]
+    assert fault.start == pytest.approx(80, abs=6)
+    assert fault.stop == pytest.approx(120, abs=6)
+    assert "not repaired: " in done.status.text
+    assert "smoothed of *" in done.status.text
 
 
 def test_what_does_not_go_together_is_refused():
