@@ -9,12 +9,13 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from controllers.denoising.denoise import MIN_DENOISE_FRAMES, DenoiseSettings, denoise
+from controllers.denoising.denoise import DenoiseSettings, denoise
 from controllers.denoising.solution import DenoiseSolution, crossfade, join_segments
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.motion import Motion
 from mapctl.protocols import Denoiser
+from mapctl.recording.inspection import MIN_FRAMES
 from mapctl.recording.masks import Mask, slice_masks, write_back_masked
 from mapctl.retarget.rigs import Rig
 
@@ -40,6 +41,8 @@ class CausalDenoiser:
         if not 1 / PRIOR_FPS <= delay <= _MAX_DELAY:
             raise RequestError(f"the delay must be {1 / PRIOR_FPS:.2f} to {_MAX_DELAY:g} s, got {delay:g}")
         self._denoiser, self._settings, self._rig = denoiser, settings or DenoiseSettings(), rig
+        if self._settings.only_faults:
+            raise RequestError("faults are found in the whole capture: leave only faults or causal denoising out")
         self._rig_identified = False  # from the capture's beginning, which later passes do not see
         self.delay, self._history = delay, past
         self._past: Motion | None = None  # frames that a pass sees
@@ -83,7 +86,7 @@ class CausalDenoiser:
         start, count = self._delivered - self._first, due - self._delivered
         result = done.slice(start, start + count)
         notes = done.notes if self._delivered == 0 else ()
-        if self._past.num_frames < MIN_DENOISE_FRAMES:
+        if self._past.num_frames < MIN_FRAMES:
             notes = (f"frames {self._delivered}:{due} were due before noise could be estimated: they were not changed",)
         result = replace(result, status=replace(result.status, notes=notes))
         if self._previous is not None:

@@ -22,13 +22,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from controllers.common.map_refinement import RefinedMotion, RefinementSettings, refine
+from controllers.common.map_refinement import RefinementSettings, refine
+from controllers.denoising.only_faults import keep_all_but_faults
 from controllers.denoising.solution import DenoiseSolution, join_segments, move_frames
 from controllers.denoising.trajectory import correct_trajectory
 from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery
+from mapctl.metrics.faults import list_inspected_faults
 from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
 from mapctl.pose import BodyPose
@@ -43,18 +45,7 @@ from mapctl.recording.fusion import (
     transfer_change,
     upsample,
 )
-from mapctl.recording.inspection import (
-    ALL,
-    NOISE_CM,
-    Artefact,
-    Inspection,
-    estimate_lead_shares,
-    exchange_swapped_limbs,
-    hold_rigid_bones,
-    inspect_recording,
-    list_artefacts,
-    travel,
-)
+from mapctl.recording.inspection import MIN_FRAMES, Inspection, correct_structure, inspect_recording
 from mapctl.recording.masks import (
     Mask,
     MissingMask,
@@ -70,9 +61,6 @@ from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL, TOES, leg_length
 from mapctl.terms import Term
 
-MIN_DENOISE_FRAMES = 8
-"""Fewest frames of a capture whose noise can be estimated."""
-_RIG_FRAMES = 3000  # frames from which the rig is identified
 _SEGMENT_SECONDS = 60.0  # seconds of a long capture that are cleaned at once
 _OVERLAP_SECONDS = 2.0  # seconds that two segments share
 _LEAD_SIGMAS = 3.0  # noise of an angle within which a joint of a lead pose may differ from what is expected
@@ -92,6 +80,8 @@ class DenoiseSettings:
     capture: CaptureKind = "auto"
     """Whether the trajectory is as good as the pose (`studio`), or drifts and floats as in estimates from `video`: then
     standing toes correct it. `auto` decides by how fast those slide in the first segment; a causal run leaves it."""
+    only_faults: bool = False
+    """Whether all stays to the bit but the frames and joints of faults, and legs and hips by a foot at fault."""
     refinement: RefinementSettings = field(default_factory=RefinementSettings)
     """Settings of the MAP stage."""
 
@@ -100,6 +90,8 @@ class DenoiseSettings:
             value = getattr(self, name)
             if value is not None and not 0 <= value <= 100:
                 raise RequestError(f"{name} must lie between 0 and 100, got {value:g}")
+        if self.only_faults and self.capture == "video":
+            raise RequestError("only faults are repaired, but a capture from video moves as a whole; leave one out")
 
 
 def denoise(
@@ -123,19 +115,16 @@ def denoise(
     with, and the frames blended with it stay but for noise. A long capture is cleaned in segments that crossfade, so
     memory beyond the capture's own does not grow with it. `progress` is called with frames done and all frames.
     """
-    settings, capture, stretched = settings or DenoiseSettings(), motion, []
-    if capture.num_frames >= MIN_DENOISE_FRAMES:
-        motion, stretched = hold_rigid_bones(capture)
+    settings, capture = settings or DenoiseSettings(), motion
+    if settings.only_faults:
+        settings = replace(settings, capture="studio")
     denoiser = denoiser if inbetweener is None else LostPartFiller(denoiser, inbetweener)
     masks = resolve_joint_names(motion, masks, rig)
     hidden = expand_valid_masks(motion, masks).joints  # checked whole: for a segment they are cut to its frames
-    # Identified once: a segment may lack the frames that show the rig's T-pose.
-    beginning, rigmap = to_canonical(motion.slice(0, min(motion.num_frames, _RIG_FRAMES)), rig)
-    motion, swapped = exchange_swapped_limbs(motion, rigmap, hidden)
-    rig, shares = as_rig(rigmap), estimate_lead_shares(beginning)
-    lead = len(shares)
+    motion, rigmap, shares, faults = correct_structure(motion, rig, hidden)
+    rig, lead = as_rig(rigmap), len(shares)
     frames, fps = motion.num_frames - lead, float(motion.fps)
-    long, shared = (max(MIN_DENOISE_FRAMES, round(seconds * fps)) for seconds in (_SEGMENT_SECONDS, _OVERLAP_SECONDS))
+    long, shared = (max(MIN_FRAMES, round(seconds * fps)) for seconds in (_SEGMENT_SECONDS, _OVERLAP_SECONDS))
     pieces: list[tuple[DenoiseSolution, int]] = []
     start = stop = 0
     while stop < frames:
@@ -157,12 +146,13 @@ def denoise(
     if lead:
         done = _prepend_lead(motion.slice(0, lead), done, shares, rigmap)
         notes.insert(0, f"the T-pose in frame 0 stays but for noise, and so do frames blended with it: 0 to {lead - 1}")
-    if swapped:
-        notes.insert(0, f"left and right limbs are swapped {len(swapped)} times: they are exchanged back")
-    if stretched:
-        notes.insert(0, f"offsets of {len(stretched)} bones vary only by noise: they are held at their medians")
+    if swapped := sum(fault.kind == "swap" for fault in faults):
+        notes.insert(0, f"left and right limbs are swapped {swapped} times: they are exchanged back")
+    if stretched := len(faults) - swapped:
+        notes.insert(0, f"offsets of {stretched} bones vary only by noise: they are held at their medians")
     status = replace(done.status, notes=tuple(notes))
-    return replace(done, capture=capture, rig=rig, faults=(*stretched, *swapped, *done.faults), status=status).assess()
+    done = replace(done, capture=capture, rig=rig, faults=(*faults, *done.faults), status=status)
+    return keep_all_but_faults(done, motion) if settings.only_faults else done.assess()
 
 
 def _prepend_lead(
@@ -210,7 +200,7 @@ def _denoise_segment(
 ) -> DenoiseSolution:
     """Denoise a segment that begins at frame `first_frame` of the capture, at PRIOR_FPS, the time that terms see."""
     began, inspection = time.perf_counter(), inspect_recording(motion, masks)
-    if motion.num_frames < MIN_DENOISE_FRAMES:
+    if motion.num_frames < MIN_FRAMES:
         note = f"{motion.num_frames} frames are too few to tell noise from motion: nothing was changed"
         nothing = torch.zeros(motion.num_frames, CANONICAL.num_joints)
         return DenoiseSolution(
@@ -255,14 +245,11 @@ def _denoise_segment(
             f"standing toes slide at {100 * found.drift:.0f} cm/s, as in estimates from video: hips are moved so that"
             " they are still, on the floor at y = 0; --capture studio leaves them",
         )
-    faults = _list_faults(inspection, observation.rigmap, clean, shown, refined)
     whole = bool(inspection.known.all() and inspection.seen_root.all()) and not terms and found is None
     if whole and _measure_roughness(clean) > _measure_roughness(motion):
         start = first_frame / PRIOR_FPS
-        clean, notes = (
-            motion,
-            (f"frames from {start:.1f} s on would become rougher than they are: they were not changed",),
-        )
+        clean = motion
+        notes = (f"frames from {start:.1f} s on would become rougher than they are: they were not changed",)
     return DenoiseSolution(
         clean,
         Status(Outcome.DONE, notes),
@@ -272,7 +259,7 @@ def _denoise_segment(
         capture=motion,
         noise=inspection.noise,
         noise_root=inspection.noise_root,
-        faults=faults,
+        faults=tuple(list_inspected_faults(inspection, rig)),
         contacts=refined.contacts,
         proposal_share=share[at],
         error=error[at],
@@ -448,53 +435,6 @@ def _fuse(
         capture, skeleton=observation.rigmap.skeleton, root_position=moved.values[:, 0], local_quat_xyzw=quats
     )
     return fused, turned.share, turned.error
-
-
-_NOISE_DEG = 0.5  # least noise of angles that is listed, degrees: optical capture has as much
-_SKATE_SPEED = 0.2  # m/s that a planted toe moves by, over some frames, before it is said to slide
-_FLOAT_HEIGHT = 0.03  # metres that it is above its support
-_FOOT_FRAMES = 3  # frames of either
-
-
-def _list_faults(
-    inspection: Inspection, rigmap: RigMap, clean: Motion, shown: Motion, refined: RefinedMotion
-) -> tuple[Artefact, ...]:
-    """List the artefacts, on the rig; `shown` is the motion before the MAP stage."""
-    capture, names, frames = inspection.motion, clean.skeleton.names, clean.num_frames
-    turns = rotations.turns_between(capture.local_quat_xyzw, clean.local_quat_xyzw)
-    turned = torch.rad2deg(turns.norm(dim=-1))
-    travelling = [names[capture.travelling_joint]]
-    moved = 100 * (travel(clean) - travel(capture)).norm(dim=-1, keepdim=True)
-    noise = [*zip(names, torch.rad2deg(inspection.noise).tolist(), strict=True)]
-    found = [Artefact(name, 0, frames, "noise", level, "deg") for name, level in noise if level >= _NOISE_DEG]
-    if 100 * inspection.noise_root >= NOISE_CM:
-        found.append(Artefact(travelling[0], 0, frames, "noise", 100 * inspection.noise_root, "cm"))
-    found += list_artefacts(names, inspection.spikes, "spike", "deg", turned)
-    found += list_artefacts(travelling, inspection.spikes_root[:, None], "spike", "cm", moved)
-    found += list_artefacts([ALL], inspection.frozen[:, None], "frozen")
-    found += list_artefacts(names, inspection.dropouts & ~inspection.frozen[:, None], "dropout")
-    indices = shown.skeleton.indices(TOES)
-    toes, feet = shown.joint_positions()[:, indices], [rigmap.joint_of[toe] for toe in indices]
-    known = [names[foot] if foot is not None else TOES[side] for side, foot in enumerate(feet)]
-    ratio = float(clean.fps) / PRIOR_FPS
-    for fault in list_foot_artefacts(known, toes, refined.contacts, refined.supports):
-        found.append(replace(fault, start=round(fault.start * ratio), stop=round(fault.stop * ratio)))
-    return tuple(found)
-
-
-def list_foot_artefacts(
-    names: Sequence[str],
-    toes: Float[Tensor, "frames 2 3"],
-    planted: Bool[Tensor, "frames 2"],
-    supports: Float[Tensor, "frames 2"],
-) -> list[Artefact]:
-    """List planted toes that slide, and that are over the height at which they rest; metres, at PRIOR_FPS."""
-    steps = torch.diff(toes[..., ::2], dim=0, prepend=toes[:1, :, ::2]).norm(dim=-1)
-    height = toes[..., 1] - supports
-    slides, floats = planted & (steps * PRIOR_FPS > _SKATE_SPEED), planted & (height > _FLOAT_HEIGHT)
-    found = list_artefacts(names, slides, "slide", "cm", steps, total=lambda part: 100 * part.sum())
-    found += list_artefacts(names, floats, "float", "cm", 100 * height)
-    return [fault for fault in found if fault.stop - fault.start >= _FOOT_FRAMES]
 
 
 _LOST_FRAMES = 8

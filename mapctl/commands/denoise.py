@@ -40,6 +40,9 @@ class Denoise(ModelCommand, options.RigOptions):
     """`video`: move the hips so that standing toes neither slide nor leave the floor at y = 0, for estimates from
     video, whose body drifts and floats. `studio`: the trajectory is as good as the pose. `auto`: as video where
     standing toes slide faster than captured ones do, but not under a walk in place."""
+    only_faults: bool = False
+    """Repair only the faults that `mapctl measure` lists, but for noise and smoothing: all other frames and joints stay
+    to the bit. A foot at fault changes legs and hips from 0.3 s before it to 0.3 s after."""
     causal: bool = False
     """Denoise as for live capture: a frame is decided at most `--delay` after it arrives."""
     delay: options.MaybeNumber = None
@@ -67,6 +70,10 @@ class Denoise(ModelCommand, options.RigOptions):
     the frames."""
     quiet: options.Quiet = False
 
+    @property
+    def settings(self) -> DenoiseSettings:
+        return DenoiseSettings(capture=self.capture, only_faults=self.only_faults)
+
 
 _MAX_NAMED = 6
 _LOW_SHARE = 0.5  # share of the frames with the proposal as it is below which a joint is named
@@ -79,6 +86,10 @@ def run(command: Denoise) -> int:
         raise RequestError("--causal has no time for a density; leave --prior out")
     if command.causal and command.capture == "video":
         raise RequestError("--capture video finds the floor from the whole capture; leave it or --causal out")
+    if command.causal and command.only_faults:
+        raise RequestError("--only-faults finds faults in the whole capture; leave it or --causal out")
+    if command.only_faults and command.capture == "video":
+        raise RequestError("--only-faults leaves the trajectory that --capture video corrects; leave one of them out")
     if command.causal and command.inbetweener is not None:
         raise RequestError("--causal leaves what is lost to the denoiser; leave --inbetweener out")
     if command.delay is not None and not command.causal:
@@ -102,7 +113,7 @@ def run(command: Denoise) -> int:
 
 
 def _denoise_file(command: Denoise) -> DenoiseSolution:
-    settings, rig = DenoiseSettings(capture=command.capture), inputs.read_rig(command.rig, command)
+    rig = inputs.read_rig(command.rig, command)
     named_masks = () if command.mask is None else load_masks(command.mask)
     densities = priors.load_choice(command.prior)
     denoiser = priors.load_denoiser(command.denoiser)
@@ -112,14 +123,14 @@ def _denoise_file(command: Denoise) -> DenoiseSolution:
         if command.causal:
             delay = _DEFAULT_DELAY if command.delay is None else command.delay
             return denoise_causal(
-                motion, denoiser, masks=masks, settings=settings, delay=delay, rig=rig, progress=progress
+                motion, denoiser, masks=masks, settings=command.settings, delay=delay, rig=rig, progress=progress
             )
         return denoise(
             motion,
             denoiser,
             inbetweener=priors.load_inbetweener(command.inbetweener or "transformer"),
             masks=masks,
-            settings=settings,
+            settings=command.settings,
             densities=densities,
             rig=rig,
             progress=progress,
@@ -224,8 +235,7 @@ class FileDenoiser:
         if not command.quiet:
             inputs.print_doubts(source, motion, self.rig)
         masks, (denoiser, inbetweener) = masks_from_missing(motion, missing), _load(self.denoiser, self.inbetweener)
-        settings = DenoiseSettings(capture=command.capture)
-        done = denoise(motion, denoiser, inbetweener=inbetweener, masks=masks, settings=settings, rig=self.rig)
+        done = denoise(motion, denoiser, inbetweener=inbetweener, masks=masks, settings=command.settings, rig=self.rig)
         own = {str(source): weight_sets.shorten_licence(motion.licence)} if motion.licence else {}
         if command.report is not None:
             path = (command.report / out.relative_to(command.out)).with_suffix(".json")

@@ -1,7 +1,7 @@
 """`mapctl measure`: the measures of a motion, or of a folder of them, beside those of a reference and of mocap."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -15,6 +15,7 @@ from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.command import ModelCommand
 from mapctl.errors import CheckpointError, MapctlError, RequestError
 from mapctl.metrics import make_comparable, realism
+from mapctl.metrics.faults import list_faults
 from mapctl.motion import Motion
 from mapctl.retarget.rigs import Rig
 from priors import checkpoints
@@ -24,7 +25,9 @@ from priors import checkpoints
 class Measure(ModelCommand, options.RigOptions):
     """Path, feet, jitter and more of a motion, beside a reference clip and mocap's own values.
 
-    Of a clip also its cycle, of a walk or a run one stride, or that it has none.
+    Of a clip also its cycle, of a walk or a run one stride, or that it has none; and its faults, the worst first:
+    spikes, frozen frames, drop-outs, noise, smoothed spans, and feet that slide, float or penetrate the floor (`mapctl
+    denoise --only-faults` repairs them, but for noise and smoothing).
     All are measured as mocap's values were: on canonical joints with Y up, at 30 frames a second if there are more. Of
     a folder the means and the largest values over its clips; beside a folder of mocap also how well a classifier
     separates the two. Clips of a folder that cannot be measured are left out and listed.
@@ -83,7 +86,7 @@ def _measure_clips(command: Measure, mixed: bool) -> dict[str, Any]:
         cycle = editing.describe_cycle(canonical, editing.find_cycle(canonical))
     except RequestError as error:
         cycle = {"none": str(error).removeprefix("no cycle is found: ")}
-    return {
+    values: dict[str, Any] = {
         "clip": str(command.clip),
         "measures": ours,
         "reference": reference,
@@ -91,6 +94,13 @@ def _measure_clips(command: Measure, mixed: bool) -> dict[str, Any]:
         "cycle": cycle,
         "notes": notes,
     }
+    try:
+        faults = list_faults(whole, rig)
+    except RequestError:  # of an unknown rig, which the notes name
+        return values
+    fps = float(whole.fps)
+    seconds = [{"start_s": fault.start / fps, "stop_s": fault.stop / fps} for fault in faults]
+    return values | {"faults": [vars(fault) | when for fault, when in zip(faults, seconds, strict=True)]}
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,6 +212,8 @@ def _print_tables(values: Mapping[str, Any]) -> None:
         _print_realism(values["realism"])
     if "cycle" in values:
         print(_describe_cycle(values["cycle"]))
+    if "faults" in values:
+        _print_faults(values["faults"])
     lines = [*(f"left out {reason}" for reason in values.get("skipped", {}).values()), *values["notes"]]
     more = [f"and {len(lines) - _MAX_LINES} more, which --json lists"] if len(lines) > _MAX_LINES else []
     print("".join(f"{line}\n" for line in [*lines[:_MAX_LINES], *more]), end="")
@@ -223,6 +235,30 @@ def _describe_cycle(cycle: Mapping[str, Any]) -> str:
     if not cycle["gait"]:
         return about
     return f"{about}; {cycle['steps_per_minute']:.0f} steps a minute, stride {cycle['stride_m']:.2f} m"
+
+
+_FAULT_COLUMNS = {
+    "kind": "fault",
+    "joint": "joint",
+    "start": "from frame",
+    "stop": "to",
+    "start_s": "from s",
+    "stop_s": "to s",
+    "amount": "size",
+    "unit": "",
+}
+
+
+def _print_faults(faults: Sequence[Mapping[str, Any]]) -> None:
+    """Print the worst faults, and noise, which is in all frames, in a line."""
+    noisy = [f"{fault['joint']} {fault['amount']:.1f} {fault['unit']}" for fault in faults if fault["kind"] == "noise"]
+    if noisy:
+        print(f"noise in all frames: {noisy[0]}" + (f", {len(noisy) - 1} more joints less" if len(noisy) > 1 else ""))
+    rows = [[fault[key] for key in _FAULT_COLUMNS] for fault in faults if fault["kind"] != "noise"]
+    if rows:
+        outputs.print_table([*_FAULT_COLUMNS.values()], rows[:_MAX_LINES])
+    rest = f", of which --json lists {len(rows) - _MAX_LINES} more" if len(rows) > _MAX_LINES else ""
+    print(f"faults: {len(rows) or 'none'}{rest}")
 
 
 def _print_realism(realism: Mapping[str, Any]) -> None:

@@ -73,7 +73,7 @@ def _plant(rigged: RiggedMotion) -> Motion:
     corrections = correct_toes(toes, toes, planted, fps)
     # Planted toes are at the height of their support, and none is lower. The ends of a contact, in which a toe is on
     # its way down or up, are left to what is between.
-    smooth, heights = gaussian.smooth(toes, _choose_smoothing(toes, fps)), toes[..., 1]
+    smooth, heights = gaussian.smooth(toes, choose_smoothing(toes, fps)), toes[..., 1]
     rest = fit_supports(smooth, planted)
     firm = heights < rest
     for foot, start, stop in true_intervals(planted):
@@ -89,7 +89,7 @@ def find_contacts(
     toes: Float[Tensor, "frames 2 3"], hips: Float[Tensor, "frames 3"], fps: float
 ) -> Bool[Tensor, "frames 2"]:
     """Find in which frames each toe is planted; contacts that noise alone parts are one. Positions in metres."""
-    sigma = _choose_smoothing(toes, fps)
+    sigma = choose_smoothing(toes, fps)
     smooth = gaussian.smooth(toes, sigma)
     noise = torch.tensor([[_NOISE_SPEED]])
     resting = compute_rest_log_probability(smooth, hips, fps, noise)
@@ -118,7 +118,7 @@ def correct_toes(
     return torch.stack([interpolate_offsets(*foot, seconds=_STEP_FADE_SECONDS, fps=fps) for foot in feet], dim=1)
 
 
-def _choose_smoothing(toes: Float[Tensor, "frames 2 3"], fps: float) -> float:
+def choose_smoothing(toes: Float[Tensor, "frames 2 3"], fps: float) -> float:
     """Choose the standard deviation in frames of the Gaussian that leaves so little of the noise."""
     # White noise of 1 makes third differences of 20 in the square; most frames have little else. Of it a Gaussian of s
     # frames leaves velocities of (4 sqrt(pi) s^3)^-1/2 a frame.

@@ -33,7 +33,7 @@ from torch import Tensor
 from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.motion import Motion
-from mapctl.numerics.intervals import fill_missing, last_observed, true_intervals
+from mapctl.numerics.intervals import fill_missing, last_observed, true_intervals, widen
 from mapctl.recording.masks import ALL, ROOT, Mask, expand_valid_masks
 from mapctl.recording.noise_estimation import (
     RESOLUTION,
@@ -41,11 +41,14 @@ from mapctl.recording.noise_estimation import (
     estimate_angle_noise,
     estimate_position_noise,
 )
-from mapctl.retarget import RigMap
+from mapctl.retarget import RigMap, to_canonical
+from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL
 
-NOISE_CM = 0.2
-"""Least noise of positions that is listed, centimetres: optical capture has as much."""
+_NOISE_DEG, _NOISE_CM = 0.5, 0.2  # least noise of angles and positions that is listed: optical capture has as much
+MIN_FRAMES = 8
+"""Fewest frames of a recording whose noise can be estimated."""
+_RIG_FRAMES = 3000  # frames from which the rig is identified
 _LOCKED_CHANGE = 1e-6  # of a quaternion, that rounding leaves of a joint which never moves
 
 
@@ -60,10 +63,11 @@ class Artefact:
     stop: int
     """One past the last frame."""
     kind: str
-    """noise, spike, dropout, frozen, slide, float, or stretch: an offset of a bone that varies only by noise."""
+    """noise, spike, dropout, frozen, swap, smoothed, slide, float, penetration, or stretch: an offset of a bone that
+    varies only by noise."""
     amount: float
-    """Noise's sigma, height of a spike or of a floating toe, distance of a slide, largest error of an offset; 0 for a
-    dropout and frozen frames."""
+    """Noise's sigma, height of a floating toe, depth of penetration, length of a slide, largest error of an offset,
+    loss of detail; of others the largest distance from what the frames around lead to."""
     unit: str
 
 
@@ -142,6 +146,20 @@ def travel(motion: Motion) -> Float[Tensor, "frames 3"]:
     return motion.moving_offsets[joint] if joint else motion.root_position
 
 
+def correct_structure(
+    motion: Motion, rig: Rig | None, hidden: Bool[Tensor, "frames joints"]
+) -> tuple[Motion, RigMap, Float[Tensor, " lead"], list[Artefact]]:
+    """Hold bones that stretch by noise and exchange swapped limbs; also return the rig, identified once, since later
+    frames may lack its T-pose, the shares of the lead pose (see `estimate_lead_shares`), and the faults.
+
+    Of `hidden` rotations nothing is inferred. RequestError where the rig's joints cannot be identified.
+    """
+    motion, stretched = hold_rigid_bones(motion) if motion.num_frames >= MIN_FRAMES else (motion, [])
+    beginning, rigmap = to_canonical(motion.slice(0, min(motion.num_frames, _RIG_FRAMES)), rig)
+    motion, swapped = exchange_swapped_limbs(motion, rigmap, hidden)
+    return motion, rigmap, estimate_lead_shares(beginning), [*stretched, *swapped]
+
+
 def inspect_recording(motion: Motion, masks: Sequence[Mask] = ()) -> Inspection:
     """Inspect a recording on any rig; RequestError for masks that name joints or frames it has not."""
     quats, position = choose_continuous_signs(motion.local_quat_xyzw), travel(motion)
@@ -154,6 +172,60 @@ def inspect_recording(motion: Motion, masks: Sequence[Mask] = ()) -> Inspection:
     noise = estimate_angle_noise(quats, ~(dropouts | spikes))
     noise_root = estimate_position_noise(position, ~(dropouts_root | spikes_root))
     return Inspection(motion, spikes, dropouts, spikes_root, dropouts_root, frozen, noise, noise_root)
+
+
+def list_value_artefacts(inspection: Inspection) -> list[Artefact]:
+    """List noise, spikes, drop-outs and frozen frames, each by how far it is from what the frames around lead to."""
+    motion, repaired, names = inspection.motion, inspection.repaired(), inspection.motion.skeleton.names
+    turned = torch.rad2deg(rotations.turns_between(motion.local_quat_xyzw, repaired.local_quat_xyzw).norm(dim=-1))
+    moved = 100 * (travel(repaired) - travel(motion)).norm(dim=-1, keepdim=True)
+    travelling, frozen = [names[motion.travelling_joint]], inspection.frozen[:, None]
+    noise = [*zip(names, torch.rad2deg(inspection.noise).tolist(), strict=True)]
+    found = [
+        Artefact(name, 0, motion.num_frames, "noise", sigma, "deg") for name, sigma in noise if sigma >= _NOISE_DEG
+    ]
+    if 100 * inspection.noise_root >= _NOISE_CM:
+        found.append(Artefact(travelling[0], 0, motion.num_frames, "noise", 100 * inspection.noise_root, "cm"))
+    found += list_artefacts(names, inspection.spikes, "spike", "deg", turned)
+    found += list_artefacts(travelling, inspection.spikes_root[:, None], "spike", "cm", moved)
+    found += list_artefacts([ALL], frozen, "frozen", "deg", turned.amax(dim=1, keepdim=True))
+    found += list_artefacts(names, inspection.dropouts & ~frozen, "dropout", "deg", turned)
+    found += list_artefacts(travelling, inspection.dropouts_root[:, None] & ~frozen, "dropout", "cm", moved)
+    return found + list_smoothed(motion)
+
+
+_SMOOTH_SECONDS, _SMOOTH_DB = 0.6, 13.0  # of a window, and by how much weaker its detail is than at that speed
+_STEP_SECONDS, _LEAST_TURN = 1 / 30, 0.003  # of a difference, and radians in that time of a joint that moves
+
+
+def list_smoothed(motion: Motion) -> list[Artefact]:
+    """List spans in which the whole body was smoothed: detail, the fourth differences of joints' turns, is weaker than
+    the clip has at that speed, in the median of the joints that move. One joint alone does not show it."""
+    fps, quats = float(motion.fps), motion.local_quat_xyzw
+    step, side = max(1, round(_STEP_SECONDS * fps)), round(_SMOOTH_SECONDS * fps / 2)
+    if motion.num_frames < 8 * side + 5 * step:
+        return []
+    turns = detail = rotations.turns_between(quats[:-step], quats[step:])
+    for _ in range(4):
+        detail = detail[step:] - detail[:-step]
+
+    def measure_level(values: Float[Tensor, "frames joints 3"]) -> Float[Tensor, "joints frames"]:
+        power = values.square().sum(dim=-1).T[None]
+        mean = torch.nn.functional.avg_pool1d(power, 2 * side + 1, 1, side, count_include_pad=False)
+        return 10 * (mean[0] + 1e-16).log10()
+
+    speed, level = measure_level(turns[2 * step :][: len(detail)]), measure_level(detail)
+    moves = speed > 20 * math.log10(_LEAST_TURN)
+    usual = moves.double().mean(dim=1) > 0.5
+    if not usual.any():
+        return []
+    speed, level, moves = speed[usual], level[usual], moves[usual]
+    away = speed - speed.mean(dim=1, keepdim=True)
+    slope = (away * level).sum(dim=1, keepdim=True) / away.square().sum(dim=1, keepdim=True).clamp_min(1e-6)
+    weaker = torch.where(moves, level.mean(dim=1, keepdim=True) + slope * away - level, 0.0).median(dim=0).values
+    before = (motion.num_frames - len(weaker)) // 2
+    spans = list_artefacts([ALL], widen(weaker > _SMOOTH_DB, side)[:, None], "smoothed", "dB", weaker[:, None])
+    return [replace(span, start=span.start + before, stop=span.stop + before) for span in spans]
 
 
 def find_gaps(motion: Motion) -> tuple[Mask, ...]:
@@ -491,7 +563,7 @@ def hold_rigid_bones(motion: Motion) -> tuple[Motion, list[Artefact]]:
             moving[joint] = held.expand_as(track)
             amount = 100 * float((track - held).norm(dim=-1).max())
             faults.append(Artefact(motion.skeleton.names[joint], 0, motion.num_frames, "stretch", amount, "cm"))
-    return replace(motion, moving_offsets=moving), [fault for fault in faults if fault.amount >= NOISE_CM]
+    return replace(motion, moving_offsets=moving), [fault for fault in faults if fault.amount >= _NOISE_CM]
 
 
 def _find_rigid_offset(track: Float[Tensor, "frames 3"], fps: float) -> Float[Tensor, "3"] | None:
