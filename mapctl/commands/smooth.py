@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 _MAX_DELAY = 1.0  # seconds
 _MIN_DELAY = 0.05
 _FPS = 60
-_FRAMES_A_PASS = 3  # sent from one pass of the smoother to the next
 
 
 @dataclass(frozen=True)
@@ -69,6 +68,6 @@ def _relay(relay: "PoseRelay", receiver: "OscReceiver", out: socket.socket, to: 
         for packet in packets:
             with suppress(OSError):  # nobody receives, or there is no room: the next frame comes anyway
                 out.sendto(packet, to)
-        if is_due and frame % _FRAMES_A_PASS == 0:
+        if is_due:
             relay.smoother.smooth()
         receiver.wait(max(0.0, due + began - time.perf_counter()))

@@ -41,8 +41,6 @@ def convolve(
     """Average the frames around each frame by a kernel's `taps`, odd in number; beyond the ends there is nothing, or
     the outermost frame repeated."""
     side = len(taps) // 2
-    if ends == "nothing" and (beyond := side - len(values) + 1) > 0:  # these meet no frame
-        taps, side = taps[beyond:-beyond], side - beyond
     channels = values.flatten(1).T[:, None] if values.ndim > 1 else values[None, None]
     if ends == "repeated":
         channels, side = torch.nn.functional.pad(channels, (side, side), mode="replicate"), 0

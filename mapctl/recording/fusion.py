@@ -64,7 +64,7 @@ def fuse_rotations(
         return rotations.multiply(start, rotations.from_rotation_vector(vector))
 
     capture, normalize = choose_continuous_signs(capture), partial(torch.nn.functional.normalize, dim=-1)
-    return fuse(proposal, capture, seen, sigma, fps, rotations.turns_between, turn, normalize)
+    return _fuse(proposal, capture, seen, sigma, fps, rotations.turns_between, turn, normalize)
 
 
 def fuse_positions(
@@ -76,10 +76,10 @@ def fuse_positions(
 ) -> Fused:
     """Estimate positions, metres, from a capture with noise `sigma` of each coordinate, and a proposal at its rate."""
     level, difference = torch.tensor([sigma], dtype=torch.float64), lambda start, stop: stop - start
-    return fuse(proposal[:, None], capture[:, None], seen[:, None], level, fps, difference, torch.add)
+    return _fuse(proposal[:, None], capture[:, None], seen[:, None], level, fps, difference, torch.add)
 
 
-def fuse(
+def _fuse(
     proposal: Tensor | None,
     capture: Float[Tensor, "frames columns width"],
     seen: Bool[Tensor, "frames columns"],
@@ -89,8 +89,7 @@ def fuse(
     add: Callable[[Tensor, Tensor], Tensor],
     normalize: Callable[[Tensor], Tensor] = torch.clone,
 ) -> Fused:
-    """Fuse columns of any kind, whose vectors from one to another, of three numbers, `difference` returns and `add`
-    adds: over seconds first, then over moments about that result, which keeps transients of the capture alone. The
+    """Fuse over seconds first, then over moments about that result, which keeps transients of the capture alone. The
     error is that of the first: near a result that follows the capture, the noise is underestimated."""
     weights, holds_proposal = seen.double(), proposal is not None
     smooth = [normalize(smooth_columns(capture, weights, hertz, fps)) for hertz in _list_cutoffs(fps)]
@@ -111,14 +110,12 @@ def smooth_columns(
     if frames <= _ORDER:
         return values
     stiffness = (2 * math.sin(math.pi * hertz / fps)) ** (-2 * _ORDER) * _difference_bands(frames)
-    out, columns, alike = np.empty(values.shape), weights.numpy(), dict[bytes, list[int]]()
-    for column in range(values.shape[1]):  # columns that were observed in the same frames are one system
-        alike.setdefault(columns[:, column].tobytes(), []).append(column)
-    for picked in alike.values():
-        weight, system = columns[:, picked[0]], stiffness.copy()
+    out, columns = np.empty(values.shape), weights.numpy()
+    for column, given in enumerate(values.double().numpy().swapaxes(0, 1)):
+        weight = columns[:, column]
+        system = stiffness.copy()
         system[-1] += np.maximum(weight, _LEAST_WEIGHT)
-        given = values[:, picked].double().numpy().reshape(frames, -1)
-        out[:, picked] = solveh_banded(system, weight[:, None] * given).reshape(frames, len(picked), -1)
+        out[:, column] = solveh_banded(system, weight[:, None] * given)
     return torch.from_numpy(out)
 
 
@@ -150,7 +147,7 @@ def _estimate(
     candidates, leverages = [residual], [_require_seen(ones, weights, holds_proposal)]
     for hertz, smooth in zip(_list_cutoffs(fps), smoothed, strict=True):
         # Averaged like the changes, or the outermost frame, where leverage is largest, would be the proposal's alone.
-        leverage = _average_leverage(len(residual), hertz, fps, seconds)
+        leverage = _average(_compute_leverage(len(residual), hertz, fps)[:, None], ones[:, :1], fps, seconds)
         # In a gap a smoother has little evidence: of the frames that it sees, how many are observed.
         shown = _average(weights, ones, fps, 1 / (4 * math.pi * hertz))
         leverage = _require_seen(leverage, shown, holds_proposal)
@@ -167,8 +164,7 @@ def _estimate(
         leverages.insert(0, nothing)
         penalties.insert(0, nothing)
     changes = [(candidate - residual).square().sum(dim=-1) * weights for candidate in candidates]
-    risks = _average(torch.stack(changes, dim=1).flatten(1), near.repeat(1, len(changes)), fps, seconds)
-    risks = risks.unflatten(1, (len(changes), -1)).transpose(0, 1) / power
+    risks = torch.stack([_average(change, near, fps, seconds) for change in changes]) / power
     risks = risks + 2 * torch.stack(leverages) - 1
     share = torch.softmax(-(risks + torch.stack(penalties)) * finer / _TEMPERATURE, dim=0)
     vector = (share[..., None] * torch.stack(candidates)).sum(dim=0)
@@ -189,14 +185,8 @@ def _average(
 ) -> Float[Tensor, "frames columns"]:
     """Average values over so many seconds (sigma), over an average weight."""
     taps = gaussian.gaussian_kernel(seconds, fps)
-    return gaussian.convolve(values, taps, "nothing") / _sum_kernel(len(values), fps, seconds) / weight
-
-
-@lru_cache(maxsize=64)
-def _sum_kernel(frames: int, fps: float, seconds: float) -> Float[Tensor, "frames 1"]:
-    """Sum the averages' weights that fall on the frames there are."""
-    ones = torch.ones(frames, 1, dtype=torch.float64)
-    return gaussian.convolve(ones, gaussian.gaussian_kernel(seconds, fps), "nothing")
+    ones = gaussian.convolve(torch.ones_like(values), taps, "nothing")
+    return gaussian.convolve(values, taps, "nothing") / ones / weight
 
 
 def _require_seen(leverage: Tensor, seen: Float[Tensor, "frames columns"], holds_proposal: bool) -> Tensor:
@@ -230,12 +220,6 @@ def _compute_leverage(frames: int, hertz: float, fps: float) -> Float[Tensor, " 
     leverage = diagonal[half].repeat(frames)
     leverage[:half], leverage[frames - half :] = diagonal[:half], diagonal[side - half :]
     return leverage
-
-
-@lru_cache(maxsize=64)
-def _average_leverage(frames: int, hertz: float, fps: float, seconds: float) -> Float[Tensor, "frames 1"]:
-    leverage = _compute_leverage(frames, hertz, fps)[:, None]
-    return _average(leverage, torch.ones_like(leverage), fps, seconds)
 
 
 def upsample(

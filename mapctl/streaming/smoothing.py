@@ -1,13 +1,16 @@
 """Fixed-lag smoothing of the poses that a tracker sends, at whatever rate and with whatever losses.
 
-The last second is fused without a proposal (`mapctl.recording.fusion`), and what is shown lies a fixed delay before its
-end: smoothers weighted by Stein's unbiased risk estimate follow fast motion and average noise, whose level is measured
-all the time. Lost frames, missing joints and spikes are unobserved, and interpolated. Beyond the last observation a
-joint comes to rest from its last velocity; when it is observed again, it is crossfaded back.
+The last second is smoothed again whenever a frame comes, and what is shown lies a fixed delay before its end. Smoothers
+of several cutoffs, which minimise the squared distance to what was observed and squared third differences (Whittaker
+1923; Eilers 2003), are weighted by Stein's unbiased estimate of their risk (Stein 1981), joint by joint and moment by
+moment: fast motion is followed, noise is averaged, and its level is measured all the time. Lost frames, missing joints
+and spikes are unobserved, and interpolated. Beyond the last observation a joint comes to rest from its last velocity;
+when it is observed again, it is crossfaded back.
 """
 
 import math
 from collections import deque
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -18,12 +21,17 @@ from torch import Tensor
 
 from mapctl import rotations
 from mapctl.features import PRIOR_FPS
-from mapctl.recording.fusion import fuse
+from mapctl.numerics.gaussian import averaging_matrix
 from mapctl.recording.inspection import ROTATIONS, SHARE, find_spikes
 from mapctl.recording.noise_estimation import choose_continuous_signs, estimate_angle_noise, estimate_position_noise
 
 _ROWS, _WINDOW = 3 * PRIOR_FPS, PRIOR_FPS  # rows by which noise is measured, and of them those that are smoothed
 _MEASURED_ROWS = 15  # fewest by which it is measured, and rows from one measurement to the next
+_HERTZ = (0.7, 1.0, 1.5, 2.0, 3.0, 4.5, 6.5, 10.0, 14.0)  # half-power frequencies of the smoothers, at PRIOR_FPS
+_HIGHEST = 0.47  # of a rate: the highest cutoff that it can hold
+_RISK_SECONDS, _TEMPERATURE = 0.5, 0.06  # sigma over which risks are averaged; smoothers of about equal risk count alike
+_LEAST_WEIGHT = 1e-6  # of an unobserved row, so that the system of a column without any has a solution
+_SPIKE_SIGMAS, _LEAST_SPIKE = 6.0, 0.1  # of noise, and radians or metres, that a spike stands out
 _TIMED_FRAMES = 60  # by whose median interval the tracker's rate is measured
 _PULL = 0.1  # share of a frame's jitter by which the steady times of frames follow it
 _BRIDGED_SECONDS = 0.25  # longest gap that is interpolated
@@ -108,14 +116,33 @@ class PoseSmoother:
         self._unsmoothed = 0
         if self._unmeasured >= _MEASURED_ROWS:
             self._measure_noise()
-        joints, fps = self._joints, float(max(1, round(1 / (self._row_frames * self._period))))
         values, seen = torch.from_numpy(self._values[-_WINDOW:]), torch.from_numpy(self._seen[-_WINDOW:])
-        values = torch.cat([choose_continuous_signs(values[:, :joints]), values[:, joints:]], dim=1)
-        scaled = torch.cat([2 * values[:, :joints], values[:, joints:]], dim=1)
-        seen = seen & ~find_spikes(scaled, seen, math.log(SHARE / ROTATIONS))
-        fused = fuse(None, values, seen, self._sigma, fps, self._difference, self._add, self._normalize).values
-        signed = torch.cat([rotations.make_sign_continuous(fused[:, :joints]), fused[:, joints:]], dim=1)
-        self._path = CubicSpline(self._time_rows()[-_WINDOW:], signed.numpy())
+        seen = seen & ~self._find_spikes(values, seen)
+        stiffness = _compute_stiffness(max(1, round(1 / (self._row_frames * self._period))))
+        smoothed = values.new_empty(len(stiffness), *values.shape)
+        leverage = values.new_empty(smoothed.shape[:-1])
+        patterns, pattern_of = torch.unique(seen, dim=1, return_inverse=True)
+        for index, pattern in enumerate(patterns.T):  # columns that were observed in the same rows
+            weight, columns = pattern.double().clamp_min(_LEAST_WEIGHT), pattern_of == index
+            smoothers = torch.linalg.inv(stiffness + weight.diag()) * weight
+            smoothed[:, :, columns] = torch.einsum("krs,scw->krcw", smoothers, values[:, columns])
+            leverage[:, :, columns] = smoothers.diagonal(dim1=1, dim2=2)[..., None]
+        power = (3 * self._sigma.square()).clamp_min(_LEAST_WEIGHT)
+        change = self._difference(self._normalize(smoothed), values).square().sum(dim=-1) / power
+        near = averaging_matrix(_WINDOW, _RISK_SECONDS * PRIOR_FPS, values.dtype)
+        risk = near @ (seen * (change + 2 * leverage)) / (near @ seen.double()).clamp_min(_LEAST_WEIGHT)
+        share = torch.softmax(-risk / _TEMPERATURE, dim=0)
+        self._path = CubicSpline(self._time_rows()[-_WINDOW:], (share[..., None] * smoothed).sum(dim=0).numpy())
+
+    def _find_spikes(self, values: Tensor, seen: Tensor) -> Bool[Tensor, "rows columns"]:
+        """Find the spikes; only columns that leave the line between two frames by far are looked at closely."""
+        scaled = torch.cat([2 * values[:, : self._joints], values[:, self._joints :]], dim=1)
+        away = (scaled[1:-1] - (scaled[:-2] + scaled[2:]) / 2).norm(dim=-1)
+        suspects = (away > _SPIKE_SIGMAS * self._sigma + _LEAST_SPIKE).any(dim=0)
+        spikes = torch.zeros_like(seen)
+        if suspects.any():
+            spikes[:, suspects] = find_spikes(scaled[:, suspects], seen[:, suspects], math.log(SHARE / ROTATIONS))
+        return spikes
 
     def _measure_noise(self) -> None:
         self._unmeasured = 0
@@ -172,3 +199,11 @@ class PoseSmoother:
     def _normalize(self, values: Tensor) -> Tensor:
         turned = torch.nn.functional.normalize(values[..., : self._joints, :], dim=-1)
         return torch.cat([turned, values[..., self._joints :, :]], dim=-2)
+
+
+@lru_cache(maxsize=8)
+def _compute_stiffness(fps: int) -> Float[Tensor, "smoothers rows rows"]:
+    """Compute the quadratic form of each smoother: squared third differences."""
+    third = torch.diff(torch.eye(_WINDOW, dtype=torch.float64), n=3, dim=0)
+    scales = [(2 * math.sin(math.pi * min(hertz / fps, _HIGHEST))) ** -6 for hertz in _HERTZ]
+    return torch.tensor(scales, dtype=torch.float64)[:, None, None] * (third.T @ third)
