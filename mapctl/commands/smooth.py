@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 _MAX_DELAY = 1.0  # seconds
 _MIN_DELAY = 0.05
 _FPS = 60
+_PARSE_SECONDS = 0.05  # no packet is left out because the machine is busy
 
 
 @dataclass(frozen=True)
@@ -46,10 +47,12 @@ def run(command: Smooth) -> int:
 
     target = Endpoint.parse(command.stream, option="--stream")
     family, address = target.resolve(option="--stream")
-    receiver = OscReceiver(Endpoint.parse(command.listen, option="--listen"))
+    receiver = OscReceiver(Endpoint.parse(command.listen, option="--listen"), parse_seconds=_PARSE_SECONDS)
     with closing(receiver), socket.socket(family, socket.SOCK_DGRAM) as out:
         if not command.quiet:
-            print(f"poses of {receiver.endpoint} go to {target} (VMC), {command.delay:g} s later; Ctrl-C ends", flush=True)
+            print(
+                f"poses of {receiver.endpoint} go to {target} (VMC), {command.delay:g} s later; Ctrl-C ends", flush=True
+            )
         with suppress(KeyboardInterrupt):
             _relay(PoseRelay(command.delay), receiver, out, (address, target.port))
     if not command.quiet:
@@ -63,7 +66,7 @@ def _relay(relay: "PoseRelay", receiver: "OscReceiver", out: socket.socket, to: 
         now = time.perf_counter() - began
         packets, is_due = relay.take(receiver.poll(), now), now >= due
         if is_due:
-            packets += relay.frame(due)
+            packets += relay.frame(now)
             frame, due = frame + 1, max(due + 1 / _FPS, now)
         for packet in packets:
             with suppress(OSError):  # nobody receives, or there is no room: the next frame comes anyway

@@ -17,16 +17,16 @@ MAX_DATAGRAM_BYTES = 16384
 """Longer packets are dropped unread. A bundle of all bones and blend shapes of an avatar has half as many."""
 OPTION = "--listen"
 _MAX_READ, _MAX_KEPT = 512, 128  # packets that one look reads, and of which it keeps the newest
-_PARSE_SECONDS = 0.004  # seconds that one look may take to understand them
 _LIBRARY = "pythonosc"
 
 
 class OscReceiver:
     """A socket that is looked into as often as its owner likes. Of too many packets the newest count."""
 
-    def __init__(self, endpoint: Endpoint):
-        """Bind the socket; RequestError where the port is taken, or the host is not this machine's."""
-        self.endpoint = endpoint
+    def __init__(self, endpoint: Endpoint, *, parse_seconds: float = 0.004):
+        """Bind the socket; RequestError where the port is taken, or the host is not this machine's. One look takes
+        `parse_seconds` at most to understand the packets."""
+        self.endpoint, self._parse_seconds = endpoint, parse_seconds
         family, address = endpoint.resolve(option=OPTION)
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         try:
@@ -43,7 +43,7 @@ class OscReceiver:
 
     def poll(self) -> list[Message]:
         """Return the messages that came since the last look, oldest first. What is no OSC is counted in `dropped`."""
-        end, found = time.perf_counter() + _PARSE_SECONDS, list[list[Message]]()
+        end, found = time.perf_counter() + self._parse_seconds, list[list[Message]]()
         for datagram in reversed(self._read()):
             if time.perf_counter() > end:
                 self._drop("too many packets")

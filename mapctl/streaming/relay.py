@@ -6,7 +6,19 @@ import numpy as np
 
 from mapctl.streaming.messages import Message
 from mapctl.streaming.orders import is_number
-from mapctl.streaming.sender import AVAILABLE, BONE, BONE_NAMES, FRAME, MIRROR, OK, ROOT, TIME, bundle, pack, read_transform
+from mapctl.streaming.sender import (
+    AVAILABLE,
+    BONE,
+    BONE_NAMES,
+    FRAME,
+    MIRROR,
+    OK,
+    ROOT,
+    TIME,
+    bundle,
+    pack,
+    read_transform,
+)
 from mapctl.streaming.smoothing import PoseSmoother
 
 _JOINTS = (ROOT, *BONE_NAMES, "UpperChest")
@@ -58,5 +70,7 @@ class PoseRelay:
             row = np.array([*numbers[:3], *values[joint] * MIRROR[3:]], dtype=float)
             if joint < _MOVING:
                 row[:3] = values[len(_JOINTS) + joint, :3] * MIRROR[:3]
-            messages.append(Message(ROOT if joint == 0 else BONE, (name, *row.tolist(), *filter(is_number, numbers[7:]))))
+            messages.append(
+                Message(ROOT if joint == 0 else BONE, (name, *row.tolist(), *filter(is_number, numbers[7:])))
+            )
         return pack([*messages, self._ok, Message(TIME, (float(seconds),))])

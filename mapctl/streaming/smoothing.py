@@ -25,11 +25,14 @@ from mapctl.numerics.gaussian import averaging_matrix
 from mapctl.recording.inspection import ROTATIONS, SHARE, find_spikes
 from mapctl.recording.noise_estimation import choose_continuous_signs, estimate_angle_noise, estimate_position_noise
 
-_ROWS, _WINDOW = 3 * PRIOR_FPS, PRIOR_FPS  # rows by which noise is measured, and of them those that are smoothed
+_ROWS, _WINDOW = 8 * PRIOR_FPS, PRIOR_FPS  # rows by which noise is measured, and of them those that are smoothed
 _MEASURED_ROWS = 15  # fewest by which it is measured, and rows from one measurement to the next
 _HERTZ = (0.7, 1.0, 1.5, 2.0, 3.0, 4.5, 6.5, 10.0, 14.0)  # half-power frequencies of the smoothers, at PRIOR_FPS
 _HIGHEST = 0.47  # of a rate: the highest cutoff that it can hold
-_RISK_SECONDS, _TEMPERATURE = 0.5, 0.06  # sigma over which risks are averaged; smoothers of about equal risk count alike
+_RISK_SECONDS, _TEMPERATURE = (
+    1.0,
+    0.06,
+)  # sigma over which risks are averaged; smoothers of about equal risk count alike
 _LEAST_WEIGHT = 1e-6  # of an unobserved row, so that the system of a column without any has a solution
 _SPIKE_SIGMAS, _LEAST_SPIKE = 6.0, 0.1  # of noise, and radians or metres, that a spike stands out
 _TIMED_FRAMES = 60  # by whose median interval the tracker's rate is measured
@@ -110,8 +113,8 @@ class PoseSmoother:
         return last + self._row_frames * self._period * np.arange(1 - _ROWS, 1)
 
     def smooth(self) -> None:
-        """Smooth the last second, if anything came since that was done."""
-        if not self._unsmoothed:
+        """Smooth the last second, if anything came since that was done, and the last row has all of its frames."""
+        if not self._unsmoothed or self._frame_in_row < self._row_frames - 1:
             return
         self._unsmoothed = 0
         if self._unmeasured >= _MEASURED_ROWS:
@@ -161,10 +164,8 @@ class PoseSmoother:
         if self._path is None:
             return self._shown.numpy(), self._known[:, 0].numpy()
         step, now, self._seconds = seconds - self._seconds, seconds - self._delay, seconds
-        target, before = (
-            self._normalize(torch.from_numpy(self._path(np.clip(time, *self._path.x[[0, -1]]))))
-            for time in (now, now - _SECANT_SECONDS)
-        )
+        times = np.clip([now - _SECANT_SECONDS, now], *self._path.x[[0, -1]])
+        before, target = self._normalize(torch.from_numpy(self._path(times)))
         lost = self._find_lost(now)
         ended = lost & (self._share > 0)
         self._resting = torch.where(ended, self._shown, self._resting)

@@ -42,7 +42,7 @@ def check(command: StreamOptions, listen: str | None = None, *, characters: int 
 
 def check_endpoints(stream: str | None, listen: str | None, *, characters: int = 1) -> None:
     """Raise RequestError for endpoints that cannot be, unknown hosts, ports that meet, or a missing package."""
-    targets: list[Endpoint] = []
+    targets, address = list[Endpoint](), ""
     if stream is not None:
         first = Endpoint.parse(stream, option=_STREAM)
         targets = [first.offset(k, option=_STREAM) for k in range(characters)]
