@@ -96,7 +96,7 @@ class PoseSmoother:
         self._intervals.append(seconds - last)
         self._period = max(float(np.median(self._intervals)), 1e-3)
         steps = max(1, round((seconds - self._frame_time) / self._period))
-        expected = self._frame_time + steps * self._period
+        expected = min(self._frame_time + steps * self._period, seconds + self._period)  # several may come at once
         self._frame_time = expected + _PULL * (seconds - expected)
         self._row_frames = max(1, round(1 / (PRIOR_FPS * self._period)))
         rows, self._frame_in_row = divmod(self._frame_in_row + steps, self._row_frames)
