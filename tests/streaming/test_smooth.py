@@ -46,7 +46,7 @@ def received(messages):
     return [message for packet in pack(messages) for message in read_messages(packet)]
 
 
-def relayed(pose_at, *, fps=30, seconds=6.0, delay=DELAY, lost=lambda frame: False):
+def relayed(pose_at, *, fps=30, seconds=4.0, delay=DELAY, lost=lambda frame: False):
     """Times and poses that come of a tracker's frames, 60 times a second, without sockets and clocks."""
     relay, assembler, frame, found = PoseRelay(delay), FrameAssembler(), 0, []
     for tick in range(round(60 * seconds)):
@@ -97,7 +97,7 @@ def test_lost_frames_are_bridged():
 
 def test_a_silence_comes_to_rest_and_is_left_smoothly():
     times, turns, _ = relayed(
-        lambda seconds: tracked(seconds, swing(seconds)), lost=lambda frame: 90 <= frame < 120
+        lambda seconds: tracked(seconds, swing(seconds)), lost=lambda frame: 90 <= frame < 120, seconds=5.0
     )  # from 3 s to 4 s
     speed = np.degrees(np.abs(np.diff(turns[:, ARM, 0]))) * 60
     at = times[1:]
@@ -113,7 +113,7 @@ def test_a_spike_does_not_pass():
 
     def pose(seconds):
         messages = tracked(seconds, swing(seconds), noise_deg=1.0, draw=draw)
-        if round(30 * seconds) in (80, 121):
+        if round(30 * seconds) in (70, 101):
             at = next(k for k, each in enumerate(messages) if each.arguments[0] == BONE_NAMES[HAND])
             messages[at] = Message(BONE, (*messages[at].arguments[:4], 0.0, 0.6, 0.0, 0.8))
         return messages
