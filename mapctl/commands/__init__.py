@@ -14,6 +14,7 @@ COMMANDS = {
     "generate": ("Generate", "Motion sampled from a prior, of any length."),
     "steer": ("Steer", "A character follows a script of speeds and directions, as in live steering."),
     "live": ("Live", "Steer characters in a browser on this machine: sliders, keys, drawn paths, recording."),
+    "smooth": ("Smooth", "Smooth a tracker's poses live, between tracker and viewer, over the VMC protocol."),
     "denoise": ("Denoise", "Denoise a capture with noise, sliding and gaps, or a folder of them."),
     "infill": ("Infill", "Fill in missing frames or joints of a motion; all else stays as it was."),
     "tween": ("Tween", "The motion between keyframes: frames of a clip, or poses of a file."),

@@ -365,17 +365,17 @@ def find_angle_spikes(
     quats: Float[Tensor, "frames joints 4"], seen: Bool[Tensor, "frames joints"]
 ) -> Bool[Tensor, "frames joints"]:
     """Find which joints spike in which frames that are seen."""
-    return _find_spikes(2 * choose_continuous_signs(quats), seen, math.log(SHARE / ROTATIONS))
+    return find_spikes(2 * choose_continuous_signs(quats), seen, math.log(SHARE / ROTATIONS))
 
 
 def find_position_spikes(
     positions: Float[Tensor, "frames 3"], seen: Bool[Tensor, " frames"]
 ) -> Bool[Tensor, " frames"]:
     """Find the frames in which the position spikes; metres."""
-    return _find_spikes(positions[:, None], seen[:, None], math.log(SHARE / _BODY))[:, 0]
+    return find_spikes(positions[:, None], seen[:, None], math.log(SHARE / _BODY))[:, 0]
 
 
-def _find_spikes(
+def find_spikes(
     values: Float[Tensor, "frames tracks width"], seen: Bool[Tensor, "frames tracks"], log_density: float
 ) -> Bool[Tensor, "frames tracks"]:
     """Find the candidates that are likelier anywhere at all, `log_density`, than where their neighbours lead.

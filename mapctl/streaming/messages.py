@@ -2,7 +2,7 @@
 
 import re
 import socket
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from mapctl.errors import RequestError
 
@@ -18,6 +18,8 @@ class Message:
     """Address, as `/VMC/Ext/T`."""
     arguments: tuple[Argument, ...] = ()
     """Arguments, in order. A float is sent as 32 bits."""
+    packed: bytes = field(default=b"", compare=False, repr=False)
+    """Its bytes, where it was received."""
 
 
 LOOPBACK = "127.0.0.1"

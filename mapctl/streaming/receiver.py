@@ -2,6 +2,7 @@
 
 import errno
 import logging
+import select
 import socket
 import time
 from collections import deque
@@ -12,20 +13,20 @@ from pythonosc.osc_packet import OscPacket
 from mapctl.errors import RequestError
 from mapctl.streaming.messages import Endpoint, Message
 
-MAX_DATAGRAM_BYTES = 4096
-"""Longer packets are dropped unread."""
+MAX_DATAGRAM_BYTES = 16384
+"""Longer packets are dropped unread. A bundle of all bones and blend shapes of an avatar has half as many."""
 OPTION = "--listen"
 _MAX_READ, _MAX_KEPT = 512, 128  # packets that one look reads, and of which it keeps the newest
-_PARSE_SECONDS = 0.004  # seconds that one look may take to understand them
 _LIBRARY = "pythonosc"
 
 
 class OscReceiver:
     """A socket that is looked into as often as its owner likes. Of too many packets the newest count."""
 
-    def __init__(self, endpoint: Endpoint):
-        """Bind the socket; RequestError where the port is taken, or the host is not this machine's."""
-        self.endpoint = endpoint
+    def __init__(self, endpoint: Endpoint, *, parse_seconds: float = 0.004):
+        """Bind the socket; RequestError where the port is taken, or the host is not this machine's. One look takes
+        `parse_seconds` at most to understand the packets."""
+        self.endpoint, self._parse_seconds = endpoint, parse_seconds
         family, address = endpoint.resolve(option=OPTION)
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         try:
@@ -42,13 +43,17 @@ class OscReceiver:
 
     def poll(self) -> list[Message]:
         """Return the messages that came since the last look, oldest first. What is no OSC is counted in `dropped`."""
-        end, found = time.perf_counter() + _PARSE_SECONDS, list[list[Message]]()
+        end, found = time.perf_counter() + self._parse_seconds, list[list[Message]]()
         for datagram in reversed(self._read()):
             if time.perf_counter() > end:
                 self._drop("too many packets")
                 continue
             found.append(self._parse(datagram))
         return [message for messages in reversed(found) for message in messages]
+
+    def wait(self, seconds: float) -> None:
+        """Wait until a packet comes, for so many seconds at most."""
+        select.select([self._socket], [], [], seconds)
 
     def close(self) -> None:
         """Close the socket."""
@@ -72,7 +77,7 @@ class OscReceiver:
 
     def _parse(self, datagram: bytes) -> list[Message]:
         try:
-            return [Message(timed.message.address, tuple(timed.message)) for timed in OscPacket(datagram).messages]
+            return list(read_messages(datagram))
         except Exception as error:  # the library raises whatever Python does where bytes make no sense
             self._drop(f"a packet that is no OSC ({type(error).__name__})")
             return []
@@ -85,7 +90,7 @@ class OscReceiver:
 def read_messages(datagram: bytes) -> Iterator[Message]:
     """Yield the messages of a packet that is known to be OSC, as a receiver of poses does."""
     for timed in OscPacket(datagram).messages:
-        yield Message(timed.message.address, tuple(timed.message))
+        yield Message(timed.message.address, tuple(timed.message), timed.message.dgram)
 
 
 def _is_from_elsewhere(record: logging.LogRecord) -> bool:

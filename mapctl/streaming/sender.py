@@ -11,7 +11,7 @@ every packet of a frame, so that bones of two frames are never taken for one whe
 import multiprocessing
 import queue
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
@@ -20,8 +20,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy import ndarray
-from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
-from pythonosc.osc_message import OscMessage
 from pythonosc.osc_message_builder import OscMessageBuilder
 
 from mapctl import kinematics, rotations
@@ -40,10 +38,12 @@ FRAME, CONTACTS, VELOCITY, FORECAST = (f"/mapctl/{name}" for name in ("frame", "
 """Addresses: the stream's time, which opens a packet; and `Guidance`."""
 _GUIDANCE = (CONTACTS, VELOCITY, FORECAST)
 _FORECAST_STEP = 5  # frames from one point of a streamed forecast to the next: a sixth of a second
-_AVAILABLE = (1, 3, 0)  # a model is loaded, calibrated, in the normal mode
+AVAILABLE = (1, 3, 0)
+"""Arguments of OK: a model is loaded, calibrated, in the normal mode."""
 _ROOT_NAME = "root"
 _TRANSFORM_NUMBERS = 7  # three of a position, four of a rotation
-_MIRROR_POSITION, _MIRROR_QUAT = np.array([-1.0, 1.0, 1.0]), np.array([1.0, -1.0, -1.0, 1.0])
+MIRROR = np.array([-1.0, 1.0, 1.0, 1.0, -1.0, -1.0, 1.0])
+"""Factors that take a position and a rotation (xyzw) from canonical axes to the protocol's, and back."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,10 +132,10 @@ def encode_frame(
     ground = position * (1.0, 0.0, 1.0) if root_travels else np.zeros(3)
     positions = skeleton.offsets.numpy().copy()
     positions[0] = position - ground
-    values = np.concatenate([positions * _MIRROR_POSITION, quats_xyzw * _MIRROR_QUAT], axis=-1)
-    root = (*(ground * _MIRROR_POSITION).tolist(), 0.0, 0.0, 0.0, 1.0)
+    values = np.concatenate([positions, quats_xyzw], axis=-1) * MIRROR
+    root = (*(ground * MIRROR[:3]).tolist(), 0.0, 0.0, 0.0, 1.0)
     bones = [Message(BONE, (name, *row)) for name, row in zip(BONE_NAMES, values.tolist(), strict=True)]
-    ends = [Message(OK, _AVAILABLE), Message(TIME, (float(seconds),))]
+    ends = [Message(OK, AVAILABLE), Message(TIME, (float(seconds),))]
     return [Message(ROOT, (_ROOT_NAME, *root)), *bones, *(guidance.encode() if guidance else ()), *ends]
 
 
@@ -159,7 +159,7 @@ class FrameAssembler:
         if address == FRAME and arguments != self._frame:
             self._forget()
             self._frame = arguments
-        elif address in (ROOT, BONE) and (found := _read_transform(arguments)) is not None:
+        elif address in (ROOT, BONE) and (found := read_transform(arguments)) is not None:
             name = ROOT if address == ROOT else found[0]
             if name in _PARTS:
                 self._parts[name] = found[1]
@@ -180,13 +180,12 @@ class FrameAssembler:
         return VmcFrame(float(seconds), root[:3], root[3:], rows[:, :3], rows[:, 3:], Guidance.decode(numbers))
 
 
-def _read_transform(arguments: tuple[object, ...]) -> tuple[str, Float[ndarray, "7"]] | None:
+def read_transform(arguments: tuple[object, ...]) -> tuple[str, Float[ndarray, "7"]] | None:
     """Return name, position and rotation in canonical axes; what comes after them, as in version 2.1, means nothing."""
     name, numbers = arguments[:1], arguments[1 : 1 + _TRANSFORM_NUMBERS]
     if not name or not isinstance(name[0], str) or len(numbers) < _TRANSFORM_NUMBERS or not _are_numbers(numbers):
         return None
-    values = np.array(numbers, dtype=np.float64)
-    return name[0], np.concatenate([values[:3] * _MIRROR_POSITION, values[3:] * _MIRROR_QUAT])
+    return name[0], np.array(numbers, dtype=np.float64) * MIRROR
 
 
 def _are_numbers(values: tuple[object, ...]) -> bool:
@@ -199,7 +198,7 @@ DEFAULT_DELAY = 0.1
 """Seconds by which the stream is behind: as late as steering lets frames be before it holds its time."""
 OPTION = "--stream"
 _MAX_BUNDLE_BYTES = 1200  # as VirtualMotionCapture itself: below what any network sends in one piece
-_BUNDLE_HEAD, _LENGTH_HEAD = 16, 4  # bytes of a bundle before its first message, and before each
+_BUNDLE_HEAD = b"#bundle\0" + (1).to_bytes(8, "big")  # and the time at which it holds: at once
 _MAX_QUEUED = 3000  # messages to a process that does not read: beyond them frames are lost
 _END_SECONDS = 3.0
 
@@ -280,22 +279,30 @@ class PoseStream:
 
 
 def pack(messages: Sequence[Message]) -> list[bytes]:
-    """Pack the messages of a frame, the time last, into packets of at most 1200 bytes, OSC bundles, in order. Each
-    begins with that time, by which a receiver finds the packets of a frame."""
-    opening = _build(Message(FRAME, messages[-1].arguments))
-    bundles, size = list[OscBundleBuilder](), _MAX_BUNDLE_BYTES
-    for message in map(_build, messages):
-        if size + _LENGTH_HEAD + message.size > _MAX_BUNDLE_BYTES:
-            bundles.append(OscBundleBuilder(IMMEDIATELY))
-            bundles[-1].add_content(opening)
-            size = _BUNDLE_HEAD + _LENGTH_HEAD + opening.size
-        bundles[-1].add_content(message)
-        size += _LENGTH_HEAD + message.size
-    return [bundle.build().dgram for bundle in bundles]
+    """Pack the messages of a frame, the time last, into packets. Each begins with that time, by which a receiver finds
+    the packets of a frame."""
+    return bundle(map(_build, messages), _build(Message(FRAME, messages[-1].arguments)))
 
 
-def _build(message: Message) -> OscMessage:
+def bundle(packed: Iterable[bytes], opening: bytes = b"") -> list[bytes]:
+    """Join packed messages, in order, to OSC bundles of at most 1200 bytes, if none of them is longer; each bundle
+    begins with `opening`."""
+    bundles, head = list[bytes](), _BUNDLE_HEAD + (_add_length(opening) if opening else b"")
+    for element in map(_add_length, packed):
+        if not bundles or len(bundles[-1]) + len(element) > _MAX_BUNDLE_BYTES:
+            bundles.append(head)
+        bundles[-1] += element
+    return bundles
+
+
+def _add_length(packed: bytes) -> bytes:
+    return len(packed).to_bytes(4, "big") + packed
+
+
+def _build(message: Message) -> bytes:
+    if message.packed:
+        return message.packed
     builder = OscMessageBuilder(message.address)
     for argument in message.arguments:
         builder.add_arg(argument)  # pyright: ignore[reportArgumentType]
-    return builder.build()
+    return builder.build().dgram

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from mapctl.commands.shared import options
 from mapctl.errors import RequestError
 from mapctl.skeleton import Skeleton
-from mapctl.streaming.messages import Endpoint
+from mapctl.streaming.messages import LOOPBACK, Endpoint
 
 if TYPE_CHECKING:
     from mapctl.streaming.receiver import OscReceiver
@@ -32,21 +32,27 @@ class StreamOptions:
 
 
 def check(command: StreamOptions, listen: str | None = None, *, characters: int = 1) -> None:
-    """Raise RequestError for endpoints that cannot be, unknown hosts, ports that meet, or a missing package."""
+    """Raise RequestError for options that cannot be, or not together."""
     if command.stream_root and command.stream is None:
         raise RequestError(f"--stream-root is an option of {_STREAM}; give both")
     if not 0 <= command.stream_delay <= _MAX_DELAY:
         raise RequestError(f"--stream-delay must be 0 to {_MAX_DELAY:g} seconds, got {command.stream_delay:g}")
-    targets: list[Endpoint] = []
-    if command.stream is not None:
-        first = Endpoint.parse(command.stream, option=_STREAM)
+    check_endpoints(command.stream, listen, characters=characters)
+
+
+def check_endpoints(stream: str | None, listen: str | None, *, characters: int = 1) -> None:
+    """Raise RequestError for endpoints that cannot be, unknown hosts, ports that meet, or a missing package."""
+    targets, address = list[Endpoint](), ""
+    if stream is not None:
+        first = Endpoint.parse(stream, option=_STREAM)
         targets = [first.offset(k, option=_STREAM) for k in range(characters)]
-        first.resolve(option=_STREAM)
+        address = first.resolve(option=_STREAM)[1]
     if listen is not None:
         source = Endpoint.parse(listen, option=_LISTEN)
-        if any(source == target for target in targets):
+        here = (source.resolve(option=_LISTEN)[1], LOOPBACK, "::1") if targets else ()
+        if any(source.port == target.port and address in here for target in targets):
             raise RequestError(f"{_LISTEN} {source} is where {_STREAM} sends poses to; choose another port")
-    if (command.stream or listen) and find_spec("pythonosc") is None:
+    if (stream or listen) and find_spec("pythonosc") is None:
         raise RequestError("streaming needs the package python-osc: pip install 'mapctl[stream]'")
 
 
