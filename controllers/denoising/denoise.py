@@ -58,7 +58,7 @@ from mapctl.recording.masks import (
 from mapctl.recording.noise_estimation import choose_continuous_signs, estimate_angle_noise, estimate_position_noise
 from mapctl.retarget import RigMap, as_rig, from_canonical, identify_rig, to_canonical
 from mapctl.retarget.rigs import Rig
-from mapctl.skeleton import CANONICAL, TOES, leg_length
+from mapctl.skeleton import CANONICAL, leg_length
 from mapctl.terms import Term
 
 _SEGMENT_SECONDS = 60.0  # seconds of a long capture that are cleaned at once
