@@ -47,23 +47,23 @@ QUANTILES = (0.5, 0.9)
 class PoseTransformerConfig(NetworkConfig):
     """Shape of the network."""
 
-    width: int = 256
+    width: int = 192
     """Numbers of a token; a multiple of twice the heads."""
-    layers: int = 5
-    """Layers of attention."""
-    heads: int = 8
+    layers: int = 3
+    """Layers of attention of the first stage, to frames alone in which a rotation, the hips' position or a target is
+    known (context and detail transformer of Qin et al. 2022, with this network's tokens, rotary positions and losses).
+    """
+    heads: int = 6
     """Heads of each."""
     kernel: int = 5
-    """Frames of each layer's convolution, one number at a time, before its attention; odd, 0 for none."""
-    detail: int = 0
-    """Layers of attention of a second stage, which corrects what the first proposes; the attention of the first is then
-    to frames alone in which a rotation, the hips' position or a target is known (context and detail transformer of Qin
-    et al. 2022, here with this network's tokens, rotary positions and losses). 0 for none."""
+    """Frames of each layer's convolution, one number at a time, before its attention; odd."""
+    detail: int = 3
+    """Layers of attention of the second stage, which corrects what the first proposes."""
 
     def __post_init__(self):
-        if min(self.width, self.layers, self.heads) < 1 or self.width % (2 * self.heads):
+        if min(self.width, self.layers, self.heads, self.detail) < 1 or self.width % (2 * self.heads):
             raise RequestError(f"a pose transformer needs layers and a width of whole pairs a head, got {self}")
-        if self.kernel and self.kernel % 2 == 0:
+        if self.kernel % 2 == 0:
             raise RequestError(f"a pose transformer's kernel must be odd, got {self.kernel}")
 
 
@@ -75,7 +75,7 @@ class ProposedPoses:
     local_matrix: Float[Tensor, "batch frames joints 3 3"]  # local rotations; the hips' is their world rotation
     contacts: Float[Tensor, "batch frames 2"]  # contact logits of the left and the right toe
     log_spread: Float[Tensor, "batch frames joints 2"]  # of metres within which a joint lies with chances QUANTILES
-    rough: "ProposedPoses | None" = None  # proposal of the first of two stages
+    rough: "ProposedPoses | None" = None  # proposal of the first stage, of the second's
 
     def poses(self, offsets: Float[Tensor, "batch joints 3"]) -> tuple[Tensor, Tensor]:
         """Return world positions, metres, and world rotation matrices of all joints on these bones."""
@@ -109,13 +109,11 @@ class PoseTransformerNetwork(nn.Module):
         self.layers = nn.ModuleList(_Layer(config) for _ in range(config.layers))
         self.norm, self.head = nn.LayerNorm(width), _make_head(width)
         self.spread = nn.Sequential(nn.Linear(width, width // 2), nn.GELU(), nn.Linear(width // 2, 2 * _JOINTS))
-        self.detail = _Detail(config) if config.detail else None
+        self.detail = _Detail(config)
 
     def forward(self, motion: PartialMotion) -> ProposedPoses:
         """Propose poses for an interpolated motion."""
         shown = rotations.to_matrix(motion.quats)
-        if self.detail is None:
-            return self._propose(motion, shown, self)
         seen = motion.known.rotations.any(dim=-1) | motion.known.ground | motion.known.effectors.any(dim=-1)
         seen = seen | ~seen.any(dim=1, keepdim=True)
         rough = self._propose(motion, shown, self, seen)
@@ -231,15 +229,12 @@ class _Layer(nn.Module):
         self.first, self.second = nn.LayerNorm(width), nn.LayerNorm(width)
         self.split, self.join = nn.Linear(width, 3 * width), nn.Linear(width, width)
         self.perceptron = nn.Sequential(nn.Linear(width, 4 * width), nn.GELU(), nn.Linear(4 * width, width))
-        self.near = (
-            nn.Conv1d(width, width, config.kernel, padding=config.kernel // 2, groups=width) if config.kernel else None
-        )
+        self.near = nn.Conv1d(width, width, config.kernel, padding=config.kernel // 2, groups=width)
 
     def forward(
         self, tokens: Tensor, phases: tuple[Tensor, Tensor], seen: Bool[Tensor, "batch frames"] | None = None
     ) -> Tensor:
-        if self.near is not None:
-            tokens = tokens + self.near(tokens.transpose(1, 2)).transpose(1, 2)
+        tokens = tokens + self.near(tokens.transpose(1, 2)).transpose(1, 2)
         parts = self.split(self.first(tokens)).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
         query, key, value = parts.float().unbind()
         mask = None if seen is None else seen[:, None, None]

@@ -7,7 +7,7 @@ from tiny_files import make_card, save_model
 
 from priors.pose_transformer import PoseTransformer, PoseTransformerConfig, PoseTransformerNetwork
 
-CONFIG = PoseTransformerConfig(width=16, layers=1, heads=2, kernel=3)
+CONFIG = PoseTransformerConfig(width=16, layers=1, heads=2, kernel=3, detail=1)
 
 
 def network(*, drawn: float = 0.0, seed: int = 0, config: PoseTransformerConfig = CONFIG) -> PoseTransformerNetwork:
@@ -15,7 +15,7 @@ def network(*, drawn: float = 0.0, seed: int = 0, config: PoseTransformerConfig 
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         result = PoseTransformerNetwork(config)
-        for parameter in result.head.parameters():
+        for parameter in (*result.head.parameters(), *result.detail.head.parameters()):
             if drawn:
                 torch.nn.init.normal_(parameter, std=drawn)
     result.std_rotation.fill_(0.3)

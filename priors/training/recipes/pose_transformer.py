@@ -20,7 +20,6 @@ from priors.training.loop import (
     Count,
     Export,
     GradientTrainer,
-    MaybeCount,
     NetworkSettings,
     Number,
     Row,
@@ -69,7 +68,6 @@ class PoseTransformerSettings(NetworkSettings):
     kind = "pose-transformer"
     used_by = "use it with --inbetweener"
     ours = PoseTransformerConfig()
-    shape_options = ("width", "layers", "detail")
     least_window = 2 * _SHORTEST_WINDOW
 
     steps: Count = 11_500
@@ -80,18 +78,6 @@ class PoseTransformerSettings(NetworkSettings):
     """Frames of the longest window; the shortest have 8, and as many are drawn of each octave."""
     learning_rate: Number = 1.5e-3
     """At its highest; less to fine-tune."""
-    width: MaybeCount = None
-    """Numbers of a frame's token, even; every 32 of them have a head of attention."""
-    layers: MaybeCount = None
-    """Layers of attention."""
-    detail: MaybeCount = None
-    """Layers of a second stage, which corrects what the first proposes; the first then looks at frames alone in which
-    something is known."""
-
-    def make_config(self) -> PoseTransformerConfig:
-        """Return the shape of the network that these settings ask for; the width decides the number of heads."""
-        config = super().make_config()
-        return config if self.width is None else replace(config, heads=max(1, self.width // 32))
 
     def make_trainer(self, parts: Split) -> "PoseTransformerTrainer":
         return PoseTransformerTrainer(self, parts.train)
@@ -212,9 +198,8 @@ def compute_losses(network: PoseTransformerNetwork, truth: PartialMotion, hidden
     shown = hide(network, hidden)
     proposed = network(shown)
     losses = _compare(proposed, truth, shown)
-    if proposed.rough is not None:
-        losses["loss"] = losses["loss"] + _compare(proposed.rough, truth, shown, spread_weight=0.0)["loss"]
-    return losses
+    assert proposed.rough is not None, "two stages propose"
+    return losses | {"loss": losses["loss"] + _compare(proposed.rough, truth, shown, spread_weight=0.0)["loss"]}
 
 
 def _compare(
