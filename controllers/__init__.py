@@ -1,7 +1,8 @@
 """The jobs: each turns a request into terms, solves, and returns a Solution."""
 
-from importlib import import_module
 from typing import TYPE_CHECKING
+
+from mapctl.lazy import import_lazily
 
 if TYPE_CHECKING:
     from controllers.denoising.denoise import DenoiseSettings as DenoiseSettings
@@ -38,16 +39,4 @@ _NAMES = {
     "mapctl.intent.keyframes": ("Drawing", "Key", "Keys"),
 }
 _HOMES = {name: home for home, names in _NAMES.items() for name in names}
-
-
-def __getattr__(name: str):
-    if name == "steer":
-        return import_module("controllers.steering.steer")
-    if name not in _HOMES:
-        raise AttributeError(f"module 'controllers' has no attribute {name!r}")
-    return getattr(import_module(_HOMES[name]), name)
-
-
-def __dir__() -> list[str]:
-    """Return the public names, which arrive on first use; what was imported for them is not meant for users."""
-    return sorted([*_HOMES, "steer"])
+__getattr__, __dir__ = import_lazily(__name__, _HOMES, {"steer": "controllers.steering.steer"}, ())

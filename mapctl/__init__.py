@@ -1,9 +1,9 @@
 """mapctl: human motion by optimisation. A learned prior scores how natural a motion is, weighted terms how well it
 meets the request."""
 
-from importlib import import_module
 from typing import TYPE_CHECKING
 
+from mapctl.lazy import import_lazily
 from mapctl.version import __version__ as __version__
 
 if TYPE_CHECKING:
@@ -32,16 +32,9 @@ _SUBMODULES = (
     *("protocols", "recording", "report", "retarget", "terms"),
 )
 _HOMES = {"load": "formats", "Motion": "motion", "Skeleton": "skeleton", "CANONICAL": "skeleton"}
-
-
-def __getattr__(name: str):
-    if name in _SUBMODULES:
-        return import_module(f"mapctl.{name}")
-    if name not in _HOMES:
-        raise AttributeError(f"module 'mapctl' has no attribute {name!r}")
-    return getattr(import_module(f"mapctl.{_HOMES[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    """Return the public names, which arrive on first use; what was imported for them is not meant for users."""
-    return sorted([*_HOMES, *_SUBMODULES, "__version__"])
+__getattr__, __dir__ = import_lazily(
+    __name__,
+    {name: f"mapctl.{home}" for name, home in _HOMES.items()},
+    {name: f"mapctl.{name}" for name in _SUBMODULES},
+    ["__version__"],
+)

@@ -1,9 +1,9 @@
 """Learned models: what motion is natural."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mapctl.errors import CheckpointError
+from mapctl.lazy import import_lazily
 from priors import checkpoints, weight_sets
 from priors.weight_sets import add_set as add_set
 from priors.weight_sets import use_weights as use_weights
@@ -31,22 +31,10 @@ _HOMES = {
     "Tweener": "tweener",
     "ConvPathPredictor": "path",
 }
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module 'priors' has no attribute {name!r}")
-    return _find_class(name)
-
-
-def _find_class(name: str) -> Any:
-    """Import the class of a model."""
-    return getattr(import_module(f"priors.{_HOMES[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *_HOMES])
-
+_find_class, __dir__ = import_lazily(
+    __name__, {name: f"priors.{home}" for name, home in _HOMES.items()}, {}, globals()
+)
+__getattr__ = _find_class
 
 AUTO = ("locomotion", "general")
 """Bundled densities that `auto` chooses from, by likelihood (see mapctl.problem.density_selection): those of them that

@@ -3,12 +3,12 @@
 `scenes.film.film(actors, "walk.mp4")` films any motions; `scenes.load("crossing.toml")` reads a scene file.
 """
 
-from importlib import import_module
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mapctl.errors import RequestError
+from mapctl.lazy import import_lazily
 
 if TYPE_CHECKING:
     from scenes import film as film
@@ -25,22 +25,10 @@ _HOMES = {
     "Actor": "scenes.scene_file",
     "SceneDescription": "scenes.scene_file",
     "load": "scenes.scene_file",
-    "film": "scenes.film",
     "Shot": "scenes.stage",
     "back_end": "scenes.renderers",
 }
-
-
-def __getattr__(name: str):
-    if name not in _HOMES:
-        raise AttributeError(f"module 'scenes' has no attribute {name!r}")
-    module = import_module(_HOMES[name])
-    return module if _HOMES[name] == f"scenes.{name}" else getattr(module, name)
-
-
-def __dir__() -> list[str]:
-    """Return the public names, which arrive on first use; what was imported for them is not meant for users."""
-    return sorted([*_HOMES, "find_scene", "list_scenes"])
+__getattr__, __dir__ = import_lazily(__name__, _HOMES, {"film": "scenes.film"}, ["find_scene", "list_scenes"])
 
 
 def list_scenes() -> tuple[str, ...]:

@@ -28,7 +28,6 @@ _STAY = "line:1"  # of an actor without a curve, which stands at its beginning
 
 Seconds = Annotated[float, Field(gt=0, le=_MAX_SECONDS)]
 Seconds0 = Annotated[float, Field(ge=0, le=_MAX_SECONDS)]
-Length = Annotated[float, Field(gt=0, le=100)]
 Coordinate = Annotated[float, Field(ge=-1000, le=1000)]
 
 
@@ -147,26 +146,6 @@ def _parse_clip_frame(text: str) -> tuple[str, int] | None:
 
 
 @dataclass(frozen=True)
-class SceneObstacle:
-    """A disc or a box on the ground."""
-
-    __pydantic_config__ = STRICT
-
-    place: tuple[Coordinate, Coordinate]
-    """Its centre, x and z, metres."""
-    radius: Annotated[float, Field(gt=0, le=100)] | None = None
-    """Radius of a disc, metres; or `size`."""
-    size: tuple[Length, Length] | None = None
-    """Width along x and depth along z of a box, metres."""
-    turn_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
-    """Turn of a box about its centre, degrees; positive turns +Z toward +X."""
-
-    def build(self) -> Obstacle:
-        """Build the obstacle; RequestError for one that is both a disc and a box, or neither."""
-        return Obstacle(self.place, self.radius, self.size, self.turn_deg)
-
-
-@dataclass(frozen=True)
 class SceneDescription:
     """Contents of a scene file."""
 
@@ -182,7 +161,7 @@ class SceneDescription:
     """Bundled or trained prior that moves the actors."""
     weights: Literal["free", "full"] | None = None
     """Set of bundled models, where the command does not name one; the environment's or the full one if not given."""
-    obstacles: tuple[SceneObstacle, ...] = ()
+    obstacles: tuple[Obstacle, ...] = ()
     """Obstacles that all actors walk around, one [[obstacles]] table each."""
     keep_apart: Annotated[float, Field(gt=0, le=10)] | None = None
     """Least distance of the actors' hips, metres; any if not given."""
@@ -217,7 +196,7 @@ def load(path: str | PathLike[str]) -> tuple[SceneDescription, tuple[Curve, ...]
     try:
         scene = toml.read(path, SceneDescription, what="scene file", unknown=_list_allowed_keys)
     except RequestError as error:
-        raise FileFormatError(path, f"camera: {error}") from error
+        raise FileFormatError(path, str(error)) from error
     named = (replace(a, name=a.name or f"actor{k}") for k, a in enumerate(scene.actors, start=1))
     scene = replace(scene, actors=tuple(named))
     _check(path, scene)
@@ -243,7 +222,7 @@ def transform_curve(actor: Actor, folder: Path) -> Curve:
 
 
 def _list_allowed_keys(key: Sequence[int | str]) -> str:
-    known = {"actors": Actor, "camera": CameraSettings, "obstacles": SceneObstacle} if len(key) > 1 else {}
+    known = {"actors": Actor, "camera": CameraSettings, "obstacles": Obstacle} if len(key) > 1 else {}
     inner = {"keys": ShotKey, "footsteps": SceneFootstep}
     table = next((inner[str(part)] for part in key[1:-1] if part in inner), known.get(str(key[0]), SceneDescription))
     return f"allowed: {', '.join(item.name for item in fields(table))}"
@@ -262,11 +241,6 @@ def _check(path: str | PathLike[str], scene: SceneDescription) -> None:
                 colours.rgb(actor.colour)
             except MapctlError as error:
                 raise FileFormatError(path, f"actors[{number}].colour: {error}") from error
-    for number, obstacle in enumerate(scene.obstacles):
-        try:
-            obstacle.build()
-        except RequestError as error:
-            raise FileFormatError(path, f"obstacles[{number}].radius: {error}") from error
     for number, name in enumerate(scene.outputs):
         if PurePath(name).name != name or name in scene.outputs[:number]:
             raise FileFormatError(path, f"outputs[{number}]: {name!r} must be a file name of its own, without folders")

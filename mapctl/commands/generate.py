@@ -55,8 +55,7 @@ class Generate(ModelCommand, options.ReadOptions):
     to: Annotated[str, arg(metavar=".bvh|.npz|.glb|...")] = ".bvh"
     """Format of the clips by its ending; a character of --rig is written with them where the ending is its own.
     Only .bvh is written as it is sampled, the others take memory for the whole clip."""
-    quiet: bool = False
-    """No lines on the clips and no progress bar."""
+    quiet: options.Quiet = False
 
 
 _MAX_CLIPS = 10_000

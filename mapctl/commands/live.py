@@ -49,8 +49,7 @@ class Live(ModelCommand, options.ReadOptions, streaming.StreamOptions):
     rig: options.OutRig = "canonical"
     """Joints and bones on which characters move, shown as mannequins: canonical, or those of a clip, a preset or a rig
     file. Recordings are on them, of a --character too, which is retargeted when it is saved."""
-    prior: options.Name = "locomotion-live"
-    """A bundled prior, or the file or run folder of a trained one."""
+    prior: options.Prior = "locomotion-live"
     seed: options.Count = 0
     """Seed of the first poses, and of what is drawn for walks."""
     liveliness: options.Liveliness = SteerSettings.liveliness

@@ -37,8 +37,7 @@ class Render(Command, options.RigOptions):
     """Width and height in pixels."""
     metres_per_unit: options.MaybeNumber = None
     """Scale of a CSV or SVG file."""
-    quiet: bool = False
-    """No line on what was written and no progress bar."""
+    quiet: options.Quiet = False
 
 
 def run(command: Render) -> int:

@@ -73,11 +73,16 @@ def _run_scene(command: RunScene, path: Path, scene: SceneDescription, curves: S
     for actor, curve in zip(scene.actors, curves, strict=True):
         rig = actor.rig and (str(path.parent / actor.rig) if Path(actor.rig).suffix else actor.rig)
         character = read_body(rig or command.rig, command)
-        obstacles = [obstacle.build() for obstacle in scene.obstacles]
         try:
             plans.append(
                 plan_shot(
-                    actor, curve, prior, character=character, folder=path.parent, options=command, obstacles=obstacles
+                    actor,
+                    curve,
+                    prior,
+                    character=character,
+                    folder=path.parent,
+                    options=command,
+                    obstacles=scene.obstacles,
                 )
             )
         except RequestError as error:

@@ -62,14 +62,11 @@ class Steer(ModelCommand, options.ReadOptions, streaming.StreamOptions):
     realtime: bool = False
     """Play against the wall clock: every step has a deadline and brings the best found by then. On a machine that
     cannot keep up the script's time runs slower than the clock's, which the summary reports."""
-    prior: options.Name = "locomotion-live"
-    """A bundled prior, or the file or run folder of a trained one."""
+    prior: options.Prior = "locomotion-live"
     stitcher: options.MaybeName = None
     """For goto_x_m: the file or run folder of a trained stitcher, which generates the approach; the bundled one if
     not given."""
-    rig: options.OutRig = "canonical"
-    """Body that moves: the canonical one, or that of a clip, on whose rig the motion is then written; or a rig by name
-    or TOML file, whose joints get the canonical bones."""
+    rig: options.BodyRig = "canonical"
     liveliness: options.Liveliness = steer.SteerSettings.liveliness
     avoid: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="X,Z,RADIUS")] = ()
     """A disc on the ground to walk around, metres; may be given several times."""
@@ -86,8 +83,7 @@ class Steer(ModelCommand, options.ReadOptions, streaming.StreamOptions):
     strict: bool = False
     """Exit with status 3 where not all that was requested holds: something of a command was not obeyed, a speed was
     lowered to what the prior can do, or a frame was late."""
-    quiet: bool = False
-    """No summary and no progress bar."""
+    quiet: options.Quiet = False
 
 
 _DETAILS = {

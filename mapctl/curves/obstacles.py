@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -15,6 +16,8 @@ from mapctl.errors import RequestError
 class Obstacle:
     """A disc of some radius, or a box of some size; as high as one likes."""
 
+    __pydantic_config__: ClassVar = {"extra": "forbid", "allow_inf_nan": False}
+
     place: tuple[float, float]
     """Its centre on the ground, x and z, metres."""
     radius: float | None = None
@@ -25,9 +28,10 @@ class Obstacle:
     """Turn of a box about its centre, degrees; positive turns +Z toward +X."""
 
     def __post_init__(self):
-        if (self.radius is None) == (self.size is None):
-            raise RequestError("an obstacle has a radius or a size, one of them")
         object.__setattr__(self, "place", read_point(self.place, 2, "the position of an obstacle"))
+        where = f"an obstacle at {self.place[0]:g}, {self.place[1]:g}"
+        if (self.radius is None) == (self.size is None):
+            raise RequestError(f"{where} has a radius or a size, one of them")
         if self.size is None:
             lengths = (read_number(self.radius, "the radius of an obstacle"),)
             object.__setattr__(self, "radius", lengths[0])
@@ -35,7 +39,7 @@ class Obstacle:
             lengths = read_point(self.size, 2, "the size of an obstacle")
             object.__setattr__(self, "size", lengths)
         if min(lengths) <= 0:
-            raise RequestError(f"lengths of an obstacle must be positive, got {lengths}")
+            raise RequestError(f"lengths of {where} must be positive, got {lengths}")
 
     @staticmethod
     def parse(text: str) -> "Obstacle":

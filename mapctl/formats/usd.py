@@ -381,17 +381,8 @@ def _rest_parts(skeleton: SkeletonPrim) -> Array:
     scales = np.linalg.norm(matrices[:, :3, :3], axis=1)
     scales *= np.where(np.linalg.det(matrices[:, :3, :3]) < 0, -1.0, 1.0)[:, None]
     turns = matrices[:, :3, :3] / np.where(abs(scales) > 1e-12, scales, 1.0)[:, None, :]
-    return np.concatenate([matrices[:, :3, 3], _to_quaternions(turns), scales], axis=1)
-
-
-def _to_quaternions(turns: Array) -> Array:
-    """Return quaternions xyzw (n, 4) of rotations (n, 3, 3): eigenvectors of the greatest eigenvalue of a symmetric
-    matrix that is built of them (Bar-Itzhack, 2000), which also serves for matrices that are nearly rotations."""
-    (a, b, c), (d, e, f), (g, h, i) = (turns[:, k].T for k in range(3))
-    rows = [[a - e - i, b + d, c + g, h - f], [b + d, e - a - i, f + h, c - g]]
-    rows += [[c + g, f + h, i - a - e, d - b], [h - f, c - g, d - b, a + e + i]]
-    symmetric = np.array(rows).transpose(2, 0, 1)
-    return np.linalg.eigh(symmetric)[1][:, :, -1]
+    turns = Rotation.from_matrix(parts.nearest_rotations(turns)).as_quat()
+    return np.concatenate([matrices[:, :3, 3], turns, scales], axis=1)
 
 
 def _corner_colours(mesh: UsdGeom.Mesh, counts: Array, vertices: Array, folder: Path) -> Array:

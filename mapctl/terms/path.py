@@ -25,14 +25,12 @@ _REACH = 0.6  # metres around the wanted arc in which the nearest point is sough
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """One joint is on the curve, and at the wanted arc in each frame."""
+    """The hips are on the curve, and at the wanted arc in each frame."""
 
     curve: Curve
-    """Curve on the ground, or in space for a joint's own path."""
+    """Curve on the ground, or in space."""
     arcs: Float[Tensor, " frames"]
     """Wanted arc of each frame of the window, metres."""
-    joint: str = "hips"
-    """Name of the joint that follows."""
     sigma_slow: float = 0.01
     """Standard deviation of the sideways offset after a Gaussian of `slow_seconds`, metres."""
     free_sway: float = 0.03
@@ -68,7 +66,7 @@ class Path:
         points = (each.numpy() for each in (positions, near.tangent_extension, near.axes, known, weights))
         sigmas = (self.sigma_raw, self.sigma_progress, self.sigma_height)
         kernels.add_path(*points, sigmas, self.sigma_slow, self.free_sway, energy, pulled)
-        self._select_target(trial, gradient)[...] += pulled
+        self._select_target(gradient)[...] += pulled
         return energy
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
@@ -77,19 +75,12 @@ class Path:
         return length(positions - self._nearest_frame(positions).position)
 
     def _positions(self, trial: Trial) -> Float[Tensor, "batch frames dims"]:
-        if self.joint == "hips" and self.curve.dims == 2:  # no need of the whole body's kinematics
-            return trial.root_xz_world
-        return self._select_axes(trial.joint_world(self.joint))
+        # On the ground there is no need of the whole body's kinematics.
+        return trial.root_xz_world if self.curve.dims == 2 else trial.joints_world[..., 0, :]
 
-    def _select_target(self, trial: Trial, gradient: TrialGradient) -> np.ndarray:
+    def _select_target(self, gradient: TrialGradient) -> np.ndarray:
         """The part of a gradient that is on `_positions`."""
-        if self.joint == "hips" and self.curve.dims == 2:
-            return gradient.root_xz_world
-        joint = gradient.joints_world[:, :, trial.skeleton.index(self.joint)]
-        return joint[..., ::2] if self.curve.dims == 2 else joint
-
-    def _select_axes(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch dims"]:
-        return positions[..., ::2] if self.curve.dims == 2 else positions
+        return gradient.root_xz_world if self.curve.dims == 2 else gradient.joints_world[:, :, 0]
 
     def _nearest_frame(self, positions: Float[Tensor, "batch frames dims"]) -> LocalFrame:
         return find_local_frames(self.curve, positions, self.arcs, reach=_REACH)
@@ -104,25 +95,24 @@ class Path:
         return torch.addmm(known, sideways, weights)
 
     def _build_smoother(self, trial: Trial, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-        sigma_frames, joint = self.slow_seconds * trial.fps, trial.skeleton.index(self.joint)
-        return _build_offset_smoother(self, trial.before, joint, sigma_frames, dtype)
+        return _build_offset_smoother(self, trial.before, self.slow_seconds * trial.fps, dtype)
 
     def past_sideways_offsets(self, past: Float[Tensor, "past 3"]) -> Float[Tensor, " past"]:
         """Return the sideways offsets of the frames before the window, metres; their arcs are extrapolated."""
         step = self.arcs[1] - self.arcs[0] if len(self.arcs) > 1 else 0.0
         around = self.arcs[0] - step * torch.arange(len(past), 0, -1)
-        positions = self._select_axes(past)
+        positions = past[..., ::2] if self.curve.dims == 2 else past
         near = find_local_frames(self.curve, positions[None], around, reach=_REACH)
         return ((positions - near.position[0]) * near.axes[0, :, 0]).sum(-1)
 
 
 @lru_cache(maxsize=8)
 def _build_offset_smoother(
-    path: Path, before: Float[Tensor, "past joints 3"], joint: int, sigma_frames: float, dtype: torch.dtype
+    path: Path, before: Float[Tensor, "past joints 3"], sigma_frames: float, dtype: torch.dtype
 ) -> tuple[Float[Tensor, " frames"], Float[Tensor, "frames frames"]]:
     """Contribution of the frames before a window to its smoothed offsets, and the matrix that smooths its own; the same
     at every evaluation of a window. Keys are compared by identity."""
-    past = before[-round(3 * sigma_frames) :, joint].detach().to(dtype)
+    past = before[-round(3 * sigma_frames) :, 0].detach().to(dtype)
     weights = gaussian.averaging_matrix(len(past) + len(path.arcs), sigma_frames, dtype)[len(past) :].T.contiguous()
     known = path.past_sideways_offsets(past) @ weights[: len(past)] if len(past) else weights.new_zeros(len(path.arcs))
     return known, weights[len(past) :]

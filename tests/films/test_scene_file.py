@@ -35,7 +35,10 @@ WRONG = {
     "no duration": (OUT + ACTOR + "speed_by_time = [[0, 1]]", "actors[0].seconds: this key is needed with speed_by"),
     "start": (OUT + ACTOR + "start = 'sit'", "actors[0].start: expected walk, stand or CLIP:FRAME, got 'sit'"),
     "key without a time": (OUT + ACTOR + "[[actors.keys]]\nlook_at = [0, 1, 2]", "actors[0].keys[0]"),
-    "disc and box": (OUT + ACTOR + "[[obstacles]]\nplace = [0, 1]\nradius = 1\nsize = [1, 1]", "obstacles[0].radius: "),
+    "disc and box": (
+        OUT + ACTOR + "[[obstacles]]\nplace = [0, 1]\nradius = 1\nsize = [1, 1]",
+        "an obstacle at 0, 1 has a radius or a size",
+    ),
     "a head that reaches": (
         OUT + ACTOR + "[[actors.keys]]\nseconds = 1\nreach = { head = [0, 1, 2] }",
         "actors[0].keys[0].reach.head: hands and feet are leftHand",

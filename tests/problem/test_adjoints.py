@@ -86,7 +86,7 @@ SETS = {
     "steering": ("noise", "travel, facing", "steps", "footing"),
     "following": ("noise", "path of the hips", "footing"),
     "heels": ("noise", "footing of heels"),
-    "with others": ("noise", "likelihood", "clear of a disc and a box", "path of a hand", "seam"),
+    "with others": ("noise", "likelihood", "clear of a disc and a box", "path in space", "seam"),
 }
 
 
