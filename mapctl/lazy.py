@@ -8,7 +8,7 @@ from typing import Any
 def import_lazily(
     package: str, homes: Mapping[str, str], modules: Mapping[str, str], others: Iterable[str]
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Return `__getattr__` and `__dir__` of a package, of the `homes` of its names, the `modules` that have a name in it,
+    """Return `__getattr__` and `__dir__` of a package, of the `homes` of its names, the `modules` with a name in it,
     and the names of `others` that it defines itself."""
 
     def find(name: str) -> Any:

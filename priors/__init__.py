@@ -31,9 +31,7 @@ _HOMES = {
     "Tweener": "tweener",
     "ConvPathPredictor": "path",
 }
-_find_class, __dir__ = import_lazily(
-    __name__, {name: f"priors.{home}" for name, home in _HOMES.items()}, {}, globals()
-)
+_find_class, __dir__ = import_lazily(__name__, {name: f"priors.{home}" for name, home in _HOMES.items()}, {}, globals())
 __getattr__ = _find_class
 
 AUTO = ("locomotion", "general")

@@ -31,7 +31,7 @@ from mapctl.pose import decode
 from mapctl.protocols import Density, Inbetweener
 from mapctl.recording.masks import MissingMask
 from mapctl.skeleton import CANONICAL, FEET, LIMBS, TOES, Skeleton
-from mapctl.terms.keep_clear import WithinReach
+from mapctl.terms import WithinReach
 
 AROUND_FRAMES = 27
 """Frames at PRIOR_FPS before and after a reach in which trunk and limb are free."""

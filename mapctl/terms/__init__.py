@@ -3,13 +3,11 @@
 from mapctl.terms.base import Term
 from mapctl.terms.foot_contact import Clearance, FootContact, LandingSigmas, Support
 from mapctl.terms.jerk import Jerk
-from mapctl.terms.keep_clear import KeepApart, KeepClear, WithinReach
-from mapctl.terms.keyframe import Keyframe
 from mapctl.terms.likelihood import LatentPrior, Likelihood
 from mapctl.terms.motion_tracking import MotionTracking
 from mapctl.terms.path import Path
-from mapctl.terms.root_velocity import RootVelocity
-from mapctl.terms.step_length import StepLength
+from mapctl.terms.positions import KeepApart, KeepClear, Keyframe, WithinReach
+from mapctl.terms.steering import RootVelocity, StepLength
 from mapctl.terms.trial import Trial
 
 __all__ = [
