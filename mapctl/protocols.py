@@ -63,7 +63,6 @@ class LastFrameState(DensityState):
     """Features of the last frame seen."""
 
     def pick(self, rows: Int[Tensor, " picked"]) -> "LastFrameState":
-        """Return the states of some batch rows."""
         return LastFrameState(self.last_frame[rows])
 
 

@@ -70,16 +70,13 @@ class WallClock(StreamClock):
         self._began = time.perf_counter()
 
     def now(self) -> float:
-        """Return the time, seconds."""
         return time.perf_counter() - self._began
 
     def wait_until(self, seconds: float) -> None:
-        """Wait until that time; return at once if it has passed."""
         if (left := seconds - self.now()) > 0:
             time.sleep(left)
 
     def hold(self, seconds: float) -> None:
-        """Set the time back by so many seconds."""
         self._began += seconds
 
     def perf_counter_at(self, seconds: float) -> float:

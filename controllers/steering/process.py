@@ -33,7 +33,7 @@ from mapctl.errors import MapctlError, RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.steering import Arrival, Command, SteeringLimits
 from mapctl.protocols import Density
-from mapctl.runtime.live_protocol import FrameChunk
+from mapctl.runtime.live_protocol import FrameChunk, LiveCharacter
 from mapctl.runtime.processes import open_pipe, preload, send_queued, spawn
 from mapctl.skeleton import CANONICAL, Skeleton
 
@@ -322,14 +322,15 @@ _PROCESS_ENDED = "a character's process ended by itself"
 preload("controllers.steering.process")
 
 
-class CharacterProcess:
-    """A character that moves by itself in real time, in a process of its own, and takes orders at any moment: a
-    LiveCharacter (mapctl.runtime.live_protocol). No order waits."""
+class CharacterProcess(LiveCharacter):
+    """A live character in a process of its own; no order waits. RequestError for points that make no curve, for a
+    position without `transitions` in the request, and for numbers that are not finite. A reset of a process that has
+    ended starts it again, which takes a while."""
 
     def __init__(self, request: CharacterRequest):
         """Start the process; several start in parallel if all are created before the first `wait`."""
         self._request = request
-        self.skeleton: Skeleton = request.skeleton
+        self.skeleton = request.skeleton
         self._start()
 
     def wait(self) -> None:
@@ -341,35 +342,26 @@ class CharacterProcess:
             raise RequestError(self._failed)
 
     def command(self, command: Command) -> None:
-        """Obey this command from now on, as far as possible (see `FrameChunk.notes`), and follow no path."""
         self._send("command", command)
 
     def walk(self, points: Sequence[tuple[float, float]], speed: float, *, closed: bool = False) -> None:
-        """Walk along a smooth curve through two or more `points` (x and z, metres) at a `speed` in m/s, then stand; on
-        and on along a closed one. RequestError where the points make no curve."""
         positions = np.array(points, dtype=np.float64).reshape(-1, 2)
         curves.through(positions, closed=closed)  # so that errors are raised here, not in the process
         self._send("walk", positions, speed, closed)
 
     def aim(self, command: Command) -> None:
-        """Reach, look and walk round obstacles as this command does; nothing else of it counts, and a path is kept."""
         self._send("aim", command)
 
     def go(self, command: Command, position: tuple[float, float], within: float, facing: float | None = None) -> None:
-        """Be at a `position` (x, z, metres) `within` so many seconds, `facing` a heading (radians; None is that of the
-        approach), if possible, and obey the command from then on; else a note has the reason. RequestError without
-        `transitions` in the request, and for numbers that are not finite."""
         if self._request.transitions is None:
             raise RequestError("this character has no transitions, which take it to a position")
         Arrival(position, within, facing)  # so that errors are raised here, not in the process
         self._send("go", command, position, within, facing)
 
     def pause(self, paused: bool) -> None:
-        """Stop the clock, or let it go on."""
         self._send("pause", paused)
 
     def reset(self) -> None:
-        """Restart from the initial pose. A process that has ended is started again, which takes a while."""
         if self._failed:
             self.close()
             self._start()
@@ -377,8 +369,6 @@ class CharacterProcess:
             self._send("reset")
 
     def poll(self) -> list[FrameChunk]:
-        """Return what was delivered since the last call, oldest first; never wait. MapctlError, after the last frame,
-        if the character has ended."""
         failed, found = self._failed, list[FrameChunk]()  # in this order: frames before the end are kept
         while self._delivered:
             found.append(self._delivered.popleft())
@@ -400,7 +390,6 @@ class CharacterProcess:
         self.close()
 
     def close(self) -> None:
-        """End the character; harmless the second time."""
         self._send("close")
         self._process.join(2.0 if self._ready.is_set() else 0.1)  # while it loads it does not listen yet
         if self._process.is_alive():

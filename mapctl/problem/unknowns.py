@@ -141,7 +141,6 @@ class LatentNoise(Parametrisation):
         return self._hold_heels(context.build_trial(features, plan.contacts, noise, log_density))
 
     def build_detached(self, unknowns: Float[Tensor, "batch unknowns"]) -> Trial | None:
-        """See Parametrisation."""
         context, batch = self.context, len(unknowns)
         noise = torch.unflatten(unknowns.detach(), -1, (context.frames, LAYOUT.continuous))
         if not fast.is_supported(noise, context.ground_pose, context.skeleton):
@@ -153,7 +152,6 @@ class LatentNoise(Parametrisation):
         return self._hold_heels(replace(trial, world_poses=poses))
 
     def pull_back(self, trial: Trial, gradient: TrialGradient) -> Float[Tensor, "batch unknowns"]:
-        """See Parametrisation."""
         assert trial.world_poses is not None
         on_world = (gradient.root_xz_world, gradient.heading, gradient.joints_world, gradient.heels_world)
         d_features = gradient.features + trial.world_poses.pull_back(*on_world)

@@ -172,7 +172,6 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
 
     @property
     def labels(self) -> dict[str, list[str]]:
-        """Values by group (gait, style) that it can be conditioned on."""
         found: dict[str, list[str]] = {}
         for name in self.reference.config.labels:
             group, _, value = name.partition("=")
@@ -180,9 +179,6 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
         return found
 
     def conditioned_on(self, labels: Sequence[str]) -> "LstmGmmDensity":
-        """Return the density given labels of its data (`run`, `active`, `style=active`), with initial states to match.
-        RequestError for labels that it does not know.
-        """
         full, starts = [self._label(name) for name in labels], self.initial_states
         known = read_labels(starts.names, self.card.data.get("labels", "")).renamed(tuple(full))
         paces = [[label_pace(find_pace(speed)) == label for label in full] for speed in starts.speed.tolist()]
@@ -198,7 +194,6 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
         return replace(self._with_network(self.reference.conditioned_on(full)), initial_states=picked)
 
     def conditioned_like_start(self, start: int) -> "LstmGmmDensity":
-        """Return the density given the labels of the clip of the initial state `start`: its gait goes on."""
         return self.conditioned_like_clip(self.initial_states.names[start])
 
     def conditioned_like_clip(self, name: str) -> "LstmGmmDensity":
@@ -210,12 +205,10 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
 
     @property
     def pace_rates(self) -> dict[tuple[str, str], float]:
-        """Changes of pace a second in its data, by the pace before and after, if paces are labels of it."""
         held, given = self.card.data.get("holds", {}), {*PACE_LABELS} <= {*self.reference.config.labels}
         return read_pace_rates(held) if given and "minutes by pace" in held else {}
 
     def with_observation_noise(self, sigma: Float[Tensor, " continuous"]) -> "LstmGmmDensity":
-        """Return the density of motion observed with errors of this sigma (physical units); see `LstmGmm`."""
         return self._with_network(self.reference.with_observation_noise(sigma))
 
     @property
@@ -245,7 +238,6 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
         raise RequestError(f"the prior {self.name!r} has no {group} {value!r}, only {values}")
 
     def start_after(self, last_frame: Float[Tensor, "batch size"]) -> LstmState:
-        """Return a state with empty memory after one frame."""
         return self.reference.start_after(last_frame)
 
     def infer_state(self, features: Float[Tensor, "frames size"]) -> LstmState:
@@ -280,17 +272,14 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
         *,
         inputs: Float[Tensor, "batch frames size"] | None = None,
     ) -> Float[Tensor, "batch frames"]:
-        """Compute the log density of each frame given those before it, nats (see `Density.log_prob`)."""
         return self.reference.log_prob(features, state, inputs=inputs)
 
     def advance(self, state: LstmState, committed: Float[Tensor, "batch frames size"]) -> LstmState:
-        """Return the state after one or more further frames were seen, without gradient."""
         return self.reference.advance(state, committed)
 
     def sample(
         self, state: LstmState, frames: int, generator: torch.Generator, *, temperature: float = 1.0
     ) -> tuple[Float[Tensor, "batch frames size"], LstmState]:
-        """Draw frames one after the other, and the state after them; `temperature` is a factor of the noise."""
         return self._rollout_engine.sample(state, frames, generator, temperature=temperature)
 
     def sample_planted(
@@ -304,25 +293,20 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
     def latents(
         self, features: Float[Tensor, "batch frames size"], state: LstmState
     ) -> tuple[DiscreteChoices, Float[Tensor, "batch frames continuous"]]:
-        """Find the plan and the noise whose rollout is the features, without gradient."""
         return self.reference.latents(features, state)
 
     def plan(self, state: LstmState, noise: Float[Tensor, "batch frames continuous"]) -> DiscreteChoices:
-        """Choose the likeliest component and contact bits of each frame along the rollout that the noise gives."""
         return self._rollout_engine.plan(state, noise)
 
     def rollout(
         self, state: LstmState, noise: Float[Tensor, "batch frames continuous"], plan: DiscreteChoices
     ) -> tuple[Float[Tensor, "batch frames size"], Float[Tensor, "batch frames"]]:
-        """Roll out features under a plan, and their log density, nats; both differentiable in the noise."""
         return self._rollout_engine.rollout(state, noise, plan)
 
     def prepare_rollout(self, state: LstmState, plan: DiscreteChoices) -> PreparedRollout:
-        """Prepare the rollouts of a search: by the kernels, or by autograd."""
         return self._fast.prepare(state, plan) if self.use_fast else super().prepare_rollout(state, plan)
 
     def plan_search(
         self, state: LstmState, noise: Float[Tensor, "batch frames continuous"]
     ) -> tuple[DiscreteChoices, PreparedRollout]:
-        """Plan along the rollout of a search's first noise, and prepare rollouts under that plan."""
         return self._fast.plan_window(state, noise) if self.use_fast else super().plan_search(state, noise)

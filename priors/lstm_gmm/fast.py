@@ -743,7 +743,6 @@ class FastWindow(PreparedRollout):
     def roll_out(
         self, noise: Float[Tensor, "batch frames continuous"]
     ) -> tuple[Float[Tensor, "batch frames size"], Float[Tensor, "batch frames"]]:
-        """See PreparedRollout."""
         batch = self._batch
         if not (self._rolled and np.array_equal(self._noise[:batch], noise.numpy())):
             self._roll(noise, GIVEN)
@@ -766,7 +765,6 @@ class FastWindow(PreparedRollout):
     def pull_back(
         self, d_features: Float[Tensor, "batch frames size"], d_log_density: Float[Tensor, "batch frames"]
     ) -> Float[Tensor, "batch frames continuous"]:
-        """See PreparedRollout."""
         fast, batch = self._fast, self._batch
         self._d_features[:batch], self._d_density[:batch] = d_features.numpy(), d_log_density.numpy()
         transposed = fast.weights if len(self._noise) == 1 else fast.transposed

@@ -124,7 +124,6 @@ class LstmState(DensityState):
     """C of both layers."""
 
     def pick(self, rows: Int[Tensor, " picked"]) -> "LstmState":
-        """The states of some batch rows."""
         return LstmState(self.last_frame[rows], self.hidden[:, rows].contiguous(), self.cell[:, rows].contiguous())
 
 

@@ -353,7 +353,6 @@ class GradientTrainer(Trainer[Network]):
         return {"optimiser": make_adam(self.weights(), self.settings.learning_rate)}
 
     def optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        """Return all optimisers, by their names in checkpoints."""
         return self._optimisers
 
     def weights(self) -> list[nn.Parameter]:

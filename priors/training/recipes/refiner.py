@@ -112,7 +112,6 @@ class RefinerSettings(Settings):
 
     @property
     def chosen(self) -> str:
-        """Regular expression for the clips."""
         return self.prior.card.data.get("match", "") if self.match is None else self.match
 
     @property

@@ -273,7 +273,6 @@ class TaughtLatents(DrawnLatents):
     cost: Tensor = field(default_factory=lambda: torch.zeros(()))  # from a standard normal
 
     def share(self, prior: Gaussian) -> Float[Tensor, "batch shared"]:
-        """Latent that both sides share over the transition."""
         count = self.missed.shape[1]
         if not count:
             self.nats.append(self.shared[:0])
@@ -285,7 +284,6 @@ class TaughtLatents(DrawnLatents):
         return torch.cat([found.draw(self.shared[:count]), super().share(prior)[count:]])
 
     def own(self, prior: Gaussian, encoded: Float[Tensor, "2 batch width"], step: int) -> Float[Tensor, "2 batch own"]:
-        """A frame's, of both sides."""
         last = self.truth.shape[2] - 1
         ahead = [min(step + number, last) for number in range(SEEN_FUTURE)]
         found = self.posterior.infer_own(self.truth[:, :, ahead], encoded)

@@ -150,7 +150,6 @@ class TweenerSettings(NetworkSettings):
     if not given, Bandai Namco's content, else the folder or the file's name without a number."""
 
     def check(self) -> None:
-        """Raise RequestError for what cannot be, before anything is read."""
         super().check()
         find_class("", self.labels)
         ConvPathPredictor.load(self.path)
