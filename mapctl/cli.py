@@ -94,7 +94,8 @@ def parse(words: Sequence[str]) -> Any:
 
 
 def _join(kinds: Mapping[str, type]) -> Any:
-    return reduce(or_, (_subcommand(name, kind) for name, kind in kinds.items()))
+    named = {name: tyro.conf.subcommand(name, prefix_name=False) for name in kinds}
+    return reduce(or_, (Annotated[kind, named[name]] for name, kind in kinds.items()))
 
 
 def _read_options(kind: Any, words: Sequence[str], prog: str, description: str) -> Any:
@@ -120,10 +121,6 @@ _DESCRIPTION = (
 def _print_version() -> int:
     print(f"mapctl {__version__}")
     return 0
-
-
-def _subcommand(name: str, kind: type) -> Any:
-    return Annotated[kind, tyro.conf.subcommand(name, prefix_name=False)]
 
 
 def _shorten_usage_error(box: str) -> str:

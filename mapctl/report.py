@@ -16,7 +16,7 @@ from mapctl import metrics
 from mapctl.curves.curve import Curve
 from mapctl.formats.atomic import write_text
 from mapctl.motion import Motion
-from mapctl.problem.solution import Solution, Status, WindowRecord
+from mapctl.problem.solution import Solution, WindowRecord
 from mapctl.version import __version__
 
 try:
@@ -41,14 +41,15 @@ def build_report(
     Keys: mapctl, request, seed, versions, prior, status, motion, ledger, measures, mocap, timing, and the job's own
     (see `Solution.details`). Without `timing` it is the cost of the solution's windows.
     """
+    status, motion = solution.status, solution.motion
     report = {
         "mapctl": __version__,
         "request": dict(request),
         "seed": seed,
         "versions": package_versions(),
         "prior": None if prior is None else {name: value for name, value in prior.items() if name != "quality"},
-        "status": summarise_status(solution.status),
-        "motion": summarise_motion(solution.motion),
+        "status": {"text": status.text, "outcome": status.outcome.value, "ok": status.ok, "notes": list(status.notes)},
+        "motion": {"frames": motion.num_frames, "fps": float(motion.fps), "seconds": motion.seconds},
         "ledger": solution.ledger.summary(),
         "measures": dict(measures),
         "mocap": None if prior is None else reference_measures(prior.get("quality", {})),
@@ -66,16 +67,6 @@ def write_report(report: Mapping[str, Any], path: str | PathLike[str]) -> None:
 def to_json(values: Any) -> str:
     """Format indented JSON that every parser reads: NaN and infinities are null."""
     return json.dumps(_replace_non_finite(values), indent=1, allow_nan=False) + "\n"
-
-
-def summarise_status(status: Status) -> dict[str, Any]:
-    """Summarise how the solve ended: text (the message), outcome, ok, notes."""
-    return {"text": status.text, "outcome": status.outcome.value, "ok": status.ok, "notes": list(status.notes)}
-
-
-def summarise_motion(motion: Motion) -> dict[str, float]:
-    """Summarise frames, frames per second and seconds."""
-    return {"frames": motion.num_frames, "fps": float(motion.fps), "seconds": motion.seconds}
 
 
 def measure_path(motion: Motion, curve: Curve, *, wanted_m: float, joint: str | None = None) -> dict[str, float]:

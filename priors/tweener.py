@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -558,26 +558,15 @@ PART_FRAMES = MAX_KEY_FRAMES // 2
 """Frames of the longest part of a gap that is split."""
 
 
-class Split(NamedTuple):
-    """A gap that is longer than the network sees."""
-
-    start: int  # first frame
-    stop: int  # one past its last
-
-    @property
-    def frames(self) -> list[int]:
-        """Frames at which poses split it, evenly from edge to edge."""
-        parts = -(-(self.stop - self.start) // PART_FRAMES)
-        return [self.start + round(part * (self.stop - self.start) / parts) for part in range(1, parts)]
+def find_splits(query: GapQuery) -> dict[range, list[int]]:
+    """Find the gaps in which nothing is known and that are longer than the network sees, and frames at which poses
+    split each, evenly from edge to edge."""
+    gaps = [range(start, stop) for _, start, stop in true_intervals(query.nothing_known[:, None])]
+    parts = {gap: -(-len(gap) // PART_FRAMES) for gap in gaps if len(gap) > MAX_KEY_FRAMES}
+    return {gap: [gap.start + round(k * len(gap) / count) for k in range(1, count)] for gap, count in parts.items()}
 
 
-def find_splits(query: GapQuery) -> list[Split]:
-    """Find the gaps in which nothing is known and that are longer than the network sees."""
-    gaps = [Split(start, stop) for _, start, stop in true_intervals(query.nothing_known[:, None])]
-    return [gap for gap in gaps if gap.stop - gap.start > MAX_KEY_FRAMES]
-
-
-def show_edges(query: GapQuery, split: Split) -> Float[Tensor, "poses joints 3"]:
+def show_edges(query: GapQuery, split: range) -> Float[Tensor, "poses joints 3"]:
     """Return the whole poses next to a gap, the one after it first, as motion DNA has them: metres from the hips,
     without the hips' rotation, of unit size. None where no pose is whole."""
     whole = (~query.missing.frames).nonzero()[:, 0]
@@ -702,24 +691,25 @@ class Tweener(checkpoints.NetworkModel[GeneratorNetwork], Inbetweener):
         local = generated.turn_to_world(wide).local_matrix[0, inside]
         return calm_poses(rotations.from_matrix(local.double())), origin
 
-    def _choose_poses(self, query: GapQuery, splits: Sequence[Split]) -> dict[int, Float[Tensor, "joints 3"]]:
+    def _choose_poses(
+        self, query: GapQuery, splits: Mapping[range, Sequence[int]]
+    ) -> dict[int, Float[Tensor, "joints 3"]]:
         """Choose the poses that split gaps, by frame, at their positions in a motion of unit size, metres, world."""
         given = {}
-        for split in splits:
+        for split, frames in splits.items():
             own = None if self.style is None else self.style.poses
             poses = show_edges(query, split) if own is None else own
             if len(poses):
-                placed = place_poses(poses, _walk_over(query), split.frames)
-                given |= dict(zip(split.frames, placed, strict=True))
+                given |= dict(zip(frames, place_poses(poses, _walk_over(query), frames), strict=True))
         return given
 
     def _describe_splits(
-        self, query: GapQuery, splits: Sequence[Split], given: Mapping[int, Float[Tensor, "joints 3"]]
+        self, query: GapQuery, splits: Mapping[range, Sequence[int]], given: Mapping[int, Float[Tensor, "joints 3"]]
     ) -> Iterator[GapSource]:
         """Tell which gaps are too long for the network, and when which poses split them."""
         by = "the keys beside it" if self.style is None or self.style.poses is None else "the style"
-        for split in splits:
-            times = ", ".join(f"{float(query.seconds[frame]):.1f}" for frame in split.frames if frame in given)
+        for split, frames in splits.items():
+            times = ", ".join(f"{float(query.seconds[frame]):.1f}" for frame in frames if frame in given)
             reason = f"longer than the {MAX_KEY_FRAMES / PRIOR_FPS:.0f} s that the {SOURCE} sees; "
             reason += f"split at {times} s by poses of {by}" if times else "give more keys"
             yield GapSource(split.start, split.stop, self.source, reason)

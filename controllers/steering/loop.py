@@ -214,7 +214,8 @@ def iterate_steps(
         clock.wait_until(begun + due - lead)
         asked = clock.now() - begun
         left = due - asked - margin
-        seconds = max(left, state.cost.needed_seconds(state.settings.least_evaluations)) if clock.real else None
+        needed = state.cost.rest + state.settings.least_evaluations * state.cost.evaluation
+        seconds = max(left, needed) if clock.real else None
         state, new = (stepper or step)(state, source(asked), seconds=seconds)
         delivered = clock.now() - begun
         if due - delivered < _MARGIN_USED * margin:

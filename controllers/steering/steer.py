@@ -135,10 +135,6 @@ class StepCost:
     rest: float = 0.005
     """Seconds of a step before its search begins and after it ends."""
 
-    def needed_seconds(self, evaluations: int) -> float:
-        """Return the seconds of a step that makes so many evaluations."""
-        return self.rest + evaluations * self.evaluation
-
     def learn(self, seconds: float, evaluations: int, *, search: float | None, cut_short: bool) -> "StepCost":
         """Return the cost as known after a step of so many seconds, whose search had `search` seconds, None without
         a limit, and ended by that limit if it was cut short."""

@@ -190,7 +190,4 @@ def _find_hips_dip(rigged: RiggedMotion, ankles: Float[Tensor, "frames 2 3"]) ->
     short = torch.where((down > 0.5 * most) & wanted, short, 0.0).amax(dim=-1)
     if float(short.max()) == 0:
         return short
-    frames = max(1, round(_HIP_DROP_SECONDS * float(rigged.motion.fps)))
-    padded = torch.nn.functional.pad(short[None, None], (frames, frames), mode="replicate")
-    highest = torch.nn.functional.max_pool1d(padded, 2 * frames + 1, stride=1)[0, 0]
-    return gaussian.convolve(highest, gaussian.kernel(frames / 2, side=2 * frames), "repeated")
+    return gaussian.envelope(short[:, None], _HIP_DROP_SECONDS, float(rigged.motion.fps))[:, 0]

@@ -31,7 +31,8 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
             scratch, mode | stat.S_IWUSR
         )  # from the beginning: what nobody may read is not shown in the meantime
         yield scratch
-        _flush_to_disk(scratch)
+        with scratch.open("rb+") as file:  # flushed: a power cut could else leave an empty file under the final name
+            os.fsync(file.fileno())
         _set_permissions(scratch, mode)
         scratch.replace(target)
     except OSError as error:
@@ -105,9 +106,3 @@ def _set_permissions(scratch: Path, mode: int) -> None:
     if _permissions(scratch) != mode:
         with suppress(PermissionError):  # file systems that know no permissions
             scratch.chmod(mode)
-
-
-def _flush_to_disk(scratch: Path) -> None:
-    """Flush the file, or a power cut after the rename could leave an empty file under the final name."""
-    with scratch.open("rb+") as file:
-        os.fsync(file.fileno())

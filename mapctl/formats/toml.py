@@ -45,9 +45,7 @@ def describe_fault(error: ValidationError, unknown: Callable[[Sequence[int | str
     return f"{where if len(where) <= _MAX_SHOWN else shorten(where, _MAX_SHOWN)}: {_describe(fault, unknown)}"
 
 
-@cache
-def _find_adapter(kind: type) -> TypeAdapter:
-    return TypeAdapter(kind)
+_find_adapter = cache(TypeAdapter)
 
 
 def _parse_toml(path: str | PathLike[str], what: str) -> str:

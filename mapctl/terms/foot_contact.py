@@ -189,11 +189,8 @@ class Support:
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the energies, nats."""
-        return 0.5 * (self._speed(trial) / self.sigma).square()
+        return 0.5 * (self.residual(trial) / self.sigma).square()
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the speed of the supporting toe over the ground, m/s; 0 in flight."""
-        return self._speed(trial)
-
-    def _speed(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         return support_speed(trial.toe_heights - self.rest_height, trial.toe_speeds)

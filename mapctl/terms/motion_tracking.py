@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 from functools import cached_property
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.features import LAYOUT, integrate_root
+from mapctl.rotations import rotate_about_y
 from mapctl.terms.trial import Trial
 
 
@@ -75,7 +75,4 @@ class MotionTracking:
 
 def _hips_relative_positions(trial: Trial) -> Float[Tensor, "batch frames joints 3"]:
     """Joint positions less the hips', in the heading frame."""
-    relative = trial.joints_world - trial.joints_world[..., :1, :]
-    sine, cosine = torch.sin(trial.heading)[..., None], torch.cos(trial.heading)[..., None]
-    x, y, z = relative.unbind(-1)
-    return torch.stack([cosine * x - sine * z, y, sine * x + cosine * z], dim=-1)
+    return rotate_about_y(trial.joints_world - trial.joints_world[..., :1, :], -trial.heading[..., None])

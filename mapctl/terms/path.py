@@ -55,8 +55,10 @@ class Path:
         offsets = ((positions - near.tangent_extension).unsqueeze(-2) * near.axes).sum(-1)
         beyond = torch.nn.functional.softshrink(offsets[..., :1], self.free_sway)
         errors = torch.cat([beyond, offsets[..., 1:]], dim=-1)
-        energy = (errors / self._axis_sigmas(positions.dtype)).square().sum(-1)
-        return 0.5 * (energy + (self._low_pass_offset(trial, offsets[..., 0]) / self.sigma_slow).square())
+        sigmas = (self.sigma_raw, self.sigma_progress, self.sigma_height)[: self.curve.dims]
+        known, weights = self._build_smoother(trial, offsets.dtype)
+        slow = torch.addmm(known, offsets[..., 0], weights)
+        return 0.5 * ((errors / errors.new_tensor(sigmas)).square().sum(-1) + (slow / self.sigma_slow).square())
 
     def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
         """Add the gradient of the summed energies of a float32 trial, and return the energies, nats."""
@@ -66,7 +68,8 @@ class Path:
         points = (each.numpy() for each in (positions, near.tangent_extension, near.axes, known, weights))
         sigmas = (self.sigma_raw, self.sigma_progress, self.sigma_height)
         kernels.add_path(*points, sigmas, self.sigma_slow, self.free_sway, energy, pulled)
-        self._select_target(gradient)[...] += pulled
+        target = gradient.root_xz_world if self.curve.dims == 2 else gradient.joints_world[:, :, 0]
+        target[...] += pulled
         return energy
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
@@ -78,21 +81,8 @@ class Path:
         # On the ground there is no need of the whole body's kinematics.
         return trial.root_xz_world if self.curve.dims == 2 else trial.joints_world[..., 0, :]
 
-    def _select_target(self, gradient: TrialGradient) -> np.ndarray:
-        """The part of a gradient that is on `_positions`."""
-        return gradient.root_xz_world if self.curve.dims == 2 else gradient.joints_world[:, :, 0]
-
     def _nearest_frame(self, positions: Float[Tensor, "batch frames dims"]) -> LocalFrame:
         return find_local_frames(self.curve, positions, self.arcs, reach=_REACH)
-
-    def _axis_sigmas(self, dtype: torch.dtype) -> Float[Tensor, " dims"]:
-        """Sigmas of the offsets along the axes, metres."""
-        return torch.tensor((self.sigma_raw, self.sigma_progress, self.sigma_height)[: self.curve.dims], dtype=dtype)
-
-    def _low_pass_offset(self, trial: Trial, sideways: Tensor) -> Tensor:
-        """The sideways offset smoothed over time, with the frames before the window that there are."""
-        known, weights = self._build_smoother(trial, sideways.dtype)
-        return torch.addmm(known, sideways, weights)
 
     def _build_smoother(self, trial: Trial, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         return _build_offset_smoother(self, trial.before, self.slow_seconds * trial.fps, dtype)

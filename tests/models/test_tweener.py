@@ -154,17 +154,17 @@ def test_a_long_gap_is_split_by_poses_of_the_style_or_of_the_keys_with_a_note():
 @pytest.mark.slow
 def test_poses_that_split_a_gap_stand_on_the_way_and_face_along_it():
     query = query_of(walk(1100, turn_rate=0.05), (1, 1099))
-    (split,) = find_splits(query)
-    assert split.frames == [221, 440, 660, 879]
+    (frames,) = find_splits(query).values()
+    assert frames == [221, 440, 660, 879]
     body = query.to_unit_size(query.motion)
-    placed = place_poses(FAST.poses, body, split.frames)
-    assert float((placed[:, 0] - body.root_position[split.frames])[:, ::2].abs().max()) < 1e-6
+    placed = place_poses(FAST.poses, body, frames)
+    assert float((placed[:, 0] - body.root_position[frames])[:, ::2].abs().max()) < 1e-6
     torch.testing.assert_close(placed[:, list(TOE_JOINTS), 1].amin(dim=1), torch.full((4,), TOE_REST_HEIGHT).double())
     across = (placed[:, 13] - placed[:, 17])[:, ::2]  # from the right upper leg to the left
     own = FAST.poses[[number * len(FAST.poses) // 4 for number in range(4)]]
     first = (own[:, 13] - own[:, 17])[:, ::2]
     turned = torch.atan2(across[:, 0], across[:, 1]) - torch.atan2(first[:, 0], first[:, 1])
-    off = turned - heading(body.local_quat_xyzw[split.frames, 0])
+    off = turned - heading(body.local_quat_xyzw[frames, 0])
     assert float(torch.sin(off / 2).abs().max()) < 1e-4
 
 
