@@ -29,7 +29,6 @@ from mapctl.inbetweening.partial_motion import PartialMotion
 from mapctl.inbetweening.query import GapSource
 from mapctl.inbetweening.root_trajectory import TREMBLE_HZ, LocalMotion, lead_over_keys
 from mapctl.inbetweening.whole_body import bend_limbs
-from mapctl.joint_ranges import JointRanges
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
 from mapctl.motion_dna import MotionDna
@@ -204,31 +203,14 @@ class ConstrainedPose:
     positions: Float[Tensor, "*batch joints 3"]  # joint positions from the hips, metres, in the same frame
 
 
-class RangeConstrainedKinematics(nn.Module):
-    """Numbers of any size in, rotations within their ranges and positions on rigid bones out. It has no weights."""
-
-    axes: Tensor
-    mid_matrix: Tensor
-    low: Tensor
-    high: Tensor
-
-    def __init__(self):
-        super().__init__()
-        ranges = joint_ranges.load()
-        # They are the code's, not learnt: weights do not hold them, the card lists them.
-        for name in ("axes", "mid_matrix", "low", "high"):
-            values = getattr(ranges, name)
-            values = values.float() if values.is_floating_point() else values
-            self.register_buffer(name, values, persistent=False)
-
-    def forward(self, rows: Float[Tensor, "*batch rows"]) -> ConstrainedPose:
-        """Return the poses of rows of POSE_ROWS numbers: the hips' by Gram and Schmidt, angles by Eq. 3, matrices in
-        each joint's order, and the forward kinematics that all use."""
-        root, free = rows.split([ROOT_ROWS, 3 * _OTHERS], dim=-1)
-        ranges = JointRanges(self.axes, self.mid_matrix, self.low, self.high)
-        others = ranges.to_matrices(ranges.constrain(free.unflatten(-1, (_OTHERS, 3))))
-        local = torch.cat([rotations.from_six(root)[..., None, :, :], others], dim=-3)
-        return ConstrainedPose(local, kinematics.positions_from_matrices(CANONICAL, local))
+def constrain_poses(rows: Float[Tensor, "*batch rows"]) -> ConstrainedPose:
+    """Return the poses of rows of POSE_ROWS numbers of any size: the hips' rotation by Gram and Schmidt, angles by
+    Eq. 3, matrices in each joint's order, and positions by the forward kinematics that all use."""
+    root, free = rows.split([ROOT_ROWS, 3 * _OTHERS], dim=-1)
+    ranges = joint_ranges.load()
+    others = ranges.to_matrices(ranges.constrain(free.unflatten(-1, (_OTHERS, 3))))
+    local = torch.cat([rotations.from_six(root)[..., None, :, :], others], dim=-3)
+    return ConstrainedPose(local, kinematics.positions_from_matrices(CANONICAL, local))
 
 
 _POSITION_ROWS = 3 * CANONICAL.num_joints
@@ -334,7 +316,6 @@ class GeneratorNetwork(nn.Module):
         self.styles = nn.ModuleList(nn.Linear(style, outs) for outs in config.up_widths if config.skips)
         # Without a PReLU, which would halve the angles on one side.
         self.last = nn.Conv1d(config.up_widths[-1], POSE_ROWS, 3, padding=1)
-        self.kinematics = RangeConstrainedKinematics()
         # Hips upright and joints about the middle of their ranges, until training.
         nn.init.normal_(self.last.weight, std=0.1 / math.sqrt(3 * config.up_widths[-1]))
         middle = torch.zeros(POSE_ROWS)
@@ -345,7 +326,7 @@ class GeneratorNetwork(nn.Module):
         """Generate poses of every frame of an image, of any length; `style` is what the style encoder gives, or 0."""
         rows = self.encode_rows(image).transpose(1, 2)
         generated, responses = self.generate(rows, style)
-        return GeneratedPoses(self.kinematics(generated.transpose(1, 2)), responses)
+        return GeneratedPoses(constrain_poses(generated.transpose(1, 2)), responses)
 
     def generate(
         self, rows: Float[Tensor, "batch rows frames"], style: Float[Tensor, "batch style"]

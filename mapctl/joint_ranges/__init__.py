@@ -41,11 +41,11 @@ class JointRanges:
 
     def to_angles(self, local_matrix: Float[Tensor, "*batch others 3 3"]) -> Float[Tensor, "*batch others 3"]:
         """Return the angles of local rotations, radians."""
-        return rotations.to_euler(self.mid_matrix.to(local_matrix).mT @ local_matrix, self.axes)
+        return rotations.to_euler(self.mid_matrix.to(local_matrix).mT @ local_matrix, self.axes.to(local_matrix.device))
 
     def to_matrices(self, angles: Float[Tensor, "*batch others 3"]) -> Float[Tensor, "*batch others 3 3"]:
         """Invert `to_angles`."""
-        return self.mid_matrix.to(angles) @ rotations.from_euler(angles, self.axes)
+        return self.mid_matrix.to(angles) @ rotations.from_euler(angles, self.axes.to(angles.device))
 
     def constrain(self, free: Float[Tensor, "*batch others 3"]) -> Float[Tensor, "*batch others 3"]:
         """Map any numbers to angles within the ranges, radians: (b - a)/2 tanh(v) + (a + b)/2.
