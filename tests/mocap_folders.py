@@ -11,8 +11,6 @@ from mapctl.motion import Motion
 
 STYLE_RIG = Make(names_of("xsens"), between={"chest": ("Chest2", "Chest3")}, extras=False)
 """100STYLE (Mason et al. 2022): 23 joints under the names of Xsens' BVH export, a T-pose with all rotations zero."""
-LAFAN_RIG = Make(names_of("lafan1"), between={"chest": ("Spine1",)}, bones_along_x=True, extras=False)
-"""LaFAN1 (Harvey et al. 2020): 22 joints, bones along x, a zero pose that is none."""
 STYLE_HEAD = (
     "STYLE_NAME,BR_START,BR_STOP,BW_START,BW_STOP,FR_START,FR_STOP,FW_START,FW_STOP,ID_START,ID_STOP,SR_START,SR_STOP,"
     "SW_START,SW_STOP,TR1_START,TR1_STOP,TR2_START,TR2_STOP,TR3_START,TR3_STOP"

@@ -5,7 +5,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
-from helpers import tiny_density
 
 from mapctl.features import LAYOUT
 from mapctl.protocols import DataLimits
@@ -59,19 +58,3 @@ def _statistics() -> tuple[torch.Tensor, torch.Tensor]:
     std[LAYOUT.slices["root_displacement_heading"]] = 0.01
     std[LAYOUT.slices["heading_change"]] = 0.05
     return mean, std
-
-
-def save_walking_density(path: Path) -> Path:
-    """Write a density that is untrained, with the statistics of the walks: it walks on, with noise."""
-    prior = tiny_density()
-    starts = prior.initial_states
-    tensors = prior.reference.state_dict() | {
-        "starts.previous": starts.state.last_frame,
-        "starts.hidden": starts.state.hidden,
-        "starts.cell": starts.state.cell,
-        "starts.speed": starts.speed,
-        "starts.weight": starts.weight,
-    }
-    card = replace(prior.card, data=prior.card.data | {"match": "walk", "split_seed": 1})
-    checkpoints.save(tensors, card, path)
-    return path

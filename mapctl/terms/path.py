@@ -20,6 +20,7 @@ from mapctl.terms.base import TrialGradient, length
 from mapctl.terms.kernels import LocalFrame, find_local_frames
 from mapctl.terms.trial import Trial
 
+_SLOW_SECONDS = 0.35  # standard deviation of the Gaussian that separates the slow offset from the sway
 _REACH = 0.6  # metres around the wanted arc in which the nearest point is sought: a crossing's other branch is farther
 
 
@@ -32,7 +33,7 @@ class Path:
     arcs: Float[Tensor, " frames"]
     """Wanted arc of each frame of the window, metres."""
     sigma_slow: float = 0.01
-    """Standard deviation of the sideways offset after a Gaussian of `slow_seconds`, metres."""
+    """Standard deviation of the sideways offset after a Gaussian of 0.35 s, metres."""
     free_sway: float = 0.03
     """Sideways offset that costs nothing by itself, metres: mocap sways by 1.9 cm rms."""
     sigma_raw: float = 0.01
@@ -41,8 +42,6 @@ class Path:
     """Standard deviation of the error of the arc, metres."""
     sigma_height: float = 0.03
     """Standard deviation of the height over a curve in space, metres."""
-    slow_seconds: float = 0.35
-    """Standard deviation of the Gaussian that separates the slow offset from the sway."""
     name: str = "path"
     unit: str = "m"
 
@@ -85,7 +84,7 @@ class Path:
         return find_local_frames(self.curve, positions, self.arcs, reach=_REACH)
 
     def _build_smoother(self, trial: Trial, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-        return _build_offset_smoother(self, trial.before, self.slow_seconds * trial.fps, dtype)
+        return _build_offset_smoother(self, trial.before, _SLOW_SECONDS * trial.fps, dtype)
 
     def past_sideways_offsets(self, past: Float[Tensor, "past 3"]) -> Float[Tensor, " past"]:
         """Return the sideways offsets of the frames before the window, metres; their arcs are extrapolated."""

@@ -12,6 +12,7 @@ from mapctl.terms.base import length
 from mapctl.terms.trial import Trial
 
 _WIDEST = CANONICAL.indices(("hips", "leftHand", "rightHand", "leftLowerArm", "rightLowerArm", "leftToes", "rightToes"))
+_LINEAR_FROM = 0.1  # metres beyond reach from which the energy rises linearly, so that no target causes a lunge
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,15 +81,13 @@ class WithinReach:
     """Distance that the limb reaches without strain, metres."""
     sigma: float = 0.02
     """Standard deviation of the distance beyond reach, metres."""
-    robust: float = 0.1
-    """Distance beyond reach from which the energy rises linearly, metres, so that no target causes a lunge."""
     name: str = "within reach"
     unit: str = "m"
 
     def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the energies, nats."""
-        shortfall = self.residual(trial) / self.robust
-        return (self.robust / self.sigma) ** 2 * ((1 + shortfall.square()).sqrt() - 1)
+        shortfall = self.residual(trial) / _LINEAR_FROM
+        return (_LINEAR_FROM / self.sigma) ** 2 * ((1 + shortfall.square()).sqrt() - 1)
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the distance beyond reach, metres; 0 where the limb reaches."""

@@ -19,6 +19,8 @@ from mapctl.terms import kernels
 from mapctl.terms.base import TrialGradient, length
 from mapctl.terms.trial import Trial
 
+_SLOW_SECONDS = 0.25  # standard deviation of the Gaussian that removes a stride's own rise and fall of speed
+
 
 @dataclass(frozen=True, eq=False)
 class RootVelocity:
@@ -36,8 +38,6 @@ class RootVelocity:
     """Standard deviation of the low-pass velocity across the target, as an angle, radians."""
     sigma_facing: float = 0.5
     """Standard deviation of the heading, radians: wide, since hips turn to either side in every stride."""
-    slow_seconds: float = 0.25
-    """Standard deviation of the Gaussian that removes a stride's own rise and fall of speed, seconds."""
     name: str = "travel"
     unit: str = "m/s"
 
@@ -97,7 +97,7 @@ def _build_velocity_smoother(
     """Contribution of the frames before a window to its low-pass velocity error, and the matrix that smooths its
     own."""
     steps = torch.diff(before[:, 0, ::2].to(dtype), dim=0) * fps
-    sigma_frames = term.slow_seconds * fps
+    sigma_frames = _SLOW_SECONDS * fps
     past = min(len(steps), len(term.velocities_before), round(3 * sigma_frames))
     error = (steps[len(steps) - past :] - term.velocities_before[len(term.velocities_before) - past :]).to(dtype)
     weights = gaussian.averaging_matrix(past + len(term.velocities), sigma_frames, dtype)[past:]

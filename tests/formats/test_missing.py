@@ -16,11 +16,6 @@ HAND = {"canonical": "leftHand", "bandai": "Hand_L", "daz": "lHand"}
 HIPS = {"canonical": "hips", "bandai": "Hips", "daz": "hip"}
 
 
-def masks_of(path):
-    """As a set."""
-    return set(masks_from_missing(*formats.load_with_missing(path)))
-
-
 @pytest.fixture(params=RIGS)
 def clip(request, tmp_path):
     """A rig's name, its motion as it is read, and its file."""

@@ -197,9 +197,6 @@ def test_the_longest_time_unsupported_is_that_of_the_definition(slide):
     assert (body.measure_longest_unsupported(toes, hips, 30.0) > 0.5) == (slide > 0.005)
 
 
-TREMOR = math.radians(0.3)
-
-
 def given(capsys, *words: object) -> dict:
     assert run("measure", *words, "--json") == 0
     return json.loads(capsys.readouterr().out)

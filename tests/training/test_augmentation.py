@@ -22,8 +22,6 @@ from priors.training.data import Corpus
 from priors.training.recipes.infiller import show_known
 from priors.training.windows import PaddedWindows, PoseVariation, PoseWindows, vary_features
 
-SWAP = CANONICAL.mirror_partners()
-
 
 def decoded(features):
     return decode(features.double(), GroundPose(torch.zeros(2).double(), torch.zeros(()).double()))

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from importlib.util import find_spec
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,8 @@ from rich.table import Table
 
 from mapctl import formats
 from mapctl.errors import RequestError, WriteError
-from mapctl.formats import atomic
+from mapctl.formats.atomic import check_folder as check_folder
+from mapctl.formats.atomic import check_writable
 from mapctl.motion import Motion
 from mapctl.runtime.stepwise import Progress
 from priors import weight_sets
@@ -32,7 +32,7 @@ def check_files(paths: Sequence[Path], *, given: Sequence[Path] = ()) -> None:
     known: set[str] = set()
     sources = {os.path.realpath(path) for path in given}
     for path in paths:
-        atomic.check_writable(path)
+        check_writable(path)
         real = os.path.realpath(path)
         if real in sources:
             raise RequestError(f"{path} would overwrite its own source; choose another name")
@@ -63,11 +63,6 @@ def require_render(*packages: str) -> None:
     if missing := [package for package in packages if find_spec(package) is None]:
         noun = "the package" if len(missing) == 1 else "the packages"
         raise RequestError(f"films need {noun} {', '.join(missing)}: pip install 'mapctl[render]'")
-
-
-def check_folder(folder: str | PathLike[str]) -> None:
-    """Raise RequestError unless the folder exists and is writable, or can be made; leaves no trace."""
-    atomic.check_folder(folder)
 
 
 @contextmanager
