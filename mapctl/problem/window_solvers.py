@@ -70,10 +70,10 @@ class SwarmProposal:
                 return Objective(LatentNoise.from_unknowns(request.context, noise).build, request.terms).energy(noise)
 
         start = torch.zeros(_KNOTS * len(_STEERING))
-        best, _ = run_swarm(
+        found = run_swarm(
             energy, start=start, spread=_SPREAD, settings=self.settings, meter=meter, generator=request.generator
         )
-        return unknowns(best[None])
+        return unknowns(found.x[None])
 
 
 @dataclass(frozen=True, eq=False)
