@@ -30,11 +30,11 @@ class Convert(Command, options.ReadOptions):
     """
 
     source: Positional[Annotated[Path, arg(metavar="IN|FOLDER")]]
-    """.bvh, .npz (mapctl's, or SMPL parameters), .pt (SMPL parameters, as of GVHMR), or .amc: its skeleton is the .asf
-    of the same name, else the only one in the folder, else named as in subject.asf+take.amc. Of a character (.glb,
-    .gltf, .vrm, .vrma, .usda, .usdc, .usd, .usdz, .fbx) its first animation, else one frame of its rest pose;
-    hero.glb#ARMATURE, hero.glb#ARMATURE/ANIMATION and hero.glb#/ANIMATION choose others. Or a folder, every motion
-    below it."""
+    """.bvh, .npz (mapctl's, or SMPL parameters), .pt (SMPL parameters, as of GVHMR), positions of markers or joints
+    (.c3d, .trc, .csv, .npy), to which a body is fitted, or .amc: its skeleton is the .asf of the same name, else the
+    only one in the folder, else named as in subject.asf+take.amc. Of a character (.glb, .gltf, .vrm, .vrma, .usda,
+    .usdc, .usd, .usdz, .fbx) its first animation, else one frame of its rest pose; hero.glb#ARMATURE,
+    hero.glb#ARMATURE/ANIMATION and hero.glb#/ANIMATION choose others. Or a folder, every motion below it."""
     out: Positional[Annotated[Path, arg(metavar="OUT|FOLDER")]]
     """.bvh, .npz, or with a skinned body .glb, .usda, .usdc, .usd or .fbx (by Blender, which must be installed): that
     of the character in IN or in --rig, where it came from such a file, else a mannequin. A .vrm is written of a VRM
@@ -64,7 +64,9 @@ class Convert(Command, options.ReadOptions):
     fps: Annotated[str | None, arg(metavar="F")] = None
     """Frames per second, as 30, 29.97 or 30000/1001: positions linear, rotations by slerp."""
     fps_in: Annotated[str | None, arg(metavar="F")] = None
-    """Frames per second of a file that does not state them: an .amc, 120 unless given, or SMPL parameters, 30."""
+    """Frames per second of a file that does not state them: an .amc, 120 unless given; SMPL parameters, a .csv or an
+    .npy, 30."""
+    markers: options.MaybeMarkers = None
     mirror: bool = False
     """Exchange left and right, on the same bones, through the plane x = 0."""
     loop: bool = False
@@ -129,7 +131,9 @@ class Conversion:
         command, rig, notes = self.command, self.source_rig, list[str]()
         may_lack = source.suffix.lower() in formats.MAY_LACK_RATE
         fps_in = self.fps_in if may_lack or not command.source.is_dir() else None
-        motion = inputs.read_motion(source, rig, fps=fps_in, body_model=command.smpl_model, quiet=command.quiet)
+        motion = inputs.read_motion(
+            source, rig, fps=fps_in, body_model=command.smpl_model, markers=command.markers, quiet=command.quiet
+        )
         edited = command.mirror or command.loop or command.plant_feet or command.in_place or command.root_motion
         if edited and command.rig is None:  # before frames are cut, since the whole clip shows the rig
             rig = as_rig(identify_rig(motion.skeleton, rig, motion=motion))

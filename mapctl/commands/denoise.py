@@ -36,6 +36,7 @@ class Denoise(ModelCommand, options.RigOptions):
     mask: options.MaybeFile = None
     """CSV with the columns joint, start, stop: frames (from 0, stop exclusive) in which a joint of the rig is missing.
     `*` is everything, `root position` the body's position. What is nan in IN is missing too."""
+    markers: options.MaybeMarkers = None
     capture: CaptureKind = "auto"
     """`video`: move the hips so that standing toes neither slide nor leave the floor at y = 0, for estimates from
     video, whose body drifts and floats. `studio`: the trajectory is as good as the pose. `auto`: as video where
@@ -117,7 +118,9 @@ def _denoise_file(command: Denoise) -> DenoiseSolution:
     named_masks = () if command.mask is None else load_masks(command.mask)
     densities = priors.load_choice(command.prior)
     denoiser = priors.load_denoiser(command.denoiser)
-    motion, missing_masks, _ = inputs.read_motion_with_gaps(command.source, rig, quiet=command.quiet)
+    motion, missing_masks, _ = inputs.read_motion_with_gaps(
+        command.source, rig, markers=command.markers, quiet=command.quiet
+    )
     masks = (*named_masks, *missing_masks)
     with outputs.show_progress("denoising", quiet=command.quiet) as progress:
         if command.causal:
@@ -231,7 +234,7 @@ class FileDenoiser:
         """Denoise one file and write the result and its report; return frames and seconds of compute."""
         torch.set_num_threads(1)
         command, unit = self.command, None if self.rig is None else self.rig.metres_per_unit
-        motion, missing = formats.load_with_missing(source, metres_per_unit=unit)
+        motion, missing = formats.load_with_missing(source, metres_per_unit=unit, markers=command.markers)
         if not command.quiet:
             inputs.print_doubts(source, motion, self.rig)
         masks, (denoiser, inbetweener) = masks_from_missing(motion, missing), _load(self.denoiser, self.inbetweener)

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -17,6 +17,7 @@ from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.formats import bvh
 from mapctl.formats.character import CharacterSource
+from mapctl.formats.marker_fit import MarkerFit
 from mapctl.formats.units import UNITS
 from mapctl.retarget.doubts import assess_fit
 from mapctl.skeleton import CANONICAL
@@ -37,6 +38,7 @@ class Info(ModelCommand, options.RigOptions):
     is sure, doubtful or refused, with reasons."""
     out: Annotated[Path | None, arg(aliases=["-o"], metavar="FILE.png")] = None
     """A picture of a clip's rig: its T-pose with both names of each joint, two frames, axes, and what is doubtful."""
+    markers: options.MaybeMarkers = None
     json: bool = False
     """Print JSON instead of tables."""
 
@@ -45,6 +47,7 @@ NOTICE = (
     "The code is MIT. Weights trained on Bandai Namco data are CC BY-NC 4.0, as that data is; the free weights, by"
     " --weights free, may be used for anything."
 )
+_MAX_MARKERS = 3
 _UNITS = {metres: name for name, metres in UNITS.items()}
 
 
@@ -151,7 +154,7 @@ def _print_clip(path: Path, command: Info) -> None:
         outputs.require_render("matplotlib")
         outputs.check_files([picture], given=[path])
     given = inputs.read_rig(command.rig, command)
-    motion = inputs.read_motion(path, given, quiet=True)
+    motion = inputs.read_motion(path, given, markers=command.markers, quiet=True)
     names = motion.skeleton.names
     about: dict[str, Any] = {"licence": motion.licence} if motion.licence else {}
     about |= {
@@ -163,6 +166,8 @@ def _print_clip(path: Path, command: Info) -> None:
     }
     if isinstance(motion.source, CharacterSource):
         about |= _describe_choices(motion.source)
+    if isinstance(motion.source, MarkerFit):
+        about["markers"] = asdict(motion.source)
     try:
         rigmap = retarget.to_canonical(motion, given)[1]
     except RequestError as refusal:
@@ -209,11 +214,21 @@ def _describe_choices(source: CharacterSource) -> dict[str, Any]:
     }
 
 
+def _print_markers(fit: Mapping[str, Any]) -> None:
+    """Print how far the fitted body is from the markers."""
+    frame, most = fit["worst_frame"]
+    worst = sorted(fit["residuals"], key=lambda label: -fit["residuals"][label])[:_MAX_MARKERS]
+    named = ", ".join(f"{label} {100 * fit['residuals'][label]:.1f}" for label in worst)
+    print(f"markers: {len(fit['residuals'])} are {100 * fit['mean']:.2f} cm from the body on average, most {named}")
+    print(f"worst frame: {frame}, {100 * most:.1f} cm on average")
+    print(f"not used ({len(fit['unused'])}): {', '.join(fit['unused']) or 'none'}")
+
+
 def _print(described: dict[str, Any], *, as_json: bool) -> None:
     if as_json:
         print(report.to_json(described), end="")
         return
-    lists = ("joints", "known_by", "unmapped", "doubts", "fit", "skeletons", "animations", "metres_per_unit")
+    lists = ("markers", "joints", "known_by", "unmapped", "doubts", "fit", "skeletons", "animations", "metres_per_unit")
     shown, metres = {key: value for key, value in described.items() if key not in lists}, described["metres_per_unit"]
     shown["fps"], shown["seconds"] = f"{described['fps']:.6g}", f"{described['seconds']:.2f}"
     shown["unit"] = f"{_UNITS[metres]} ({metres:g} m)" if metres in _UNITS else f"{metres:g} m"
@@ -227,6 +242,8 @@ def _print(described: dict[str, Any], *, as_json: bool) -> None:
                 seconds = f"{one['seconds']:.2f} s" if "seconds" in one else ""
                 rows.append([one["name"], seconds, "read" if one["read"] else one["choose"]])
             outputs.print_table([kind, "", "read, or chosen by"], rows)
+    if fit := described.get("markers"):
+        _print_markers(fit)
     if described["joints"]:
         outputs.print_table(["canonical", "joint of the rig"], [[c, own] for c, own in described["joints"].items()])
     print(f"not canonical ({len(described['unmapped'])}): {', '.join(described['unmapped']) or 'none'}")

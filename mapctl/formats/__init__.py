@@ -23,7 +23,8 @@ USD_WRITTEN = (".usda", ".usdc", ".usd")
 _GLTF, _USD = (".glb", ".gltf", ".vrm", ".vrma"), (*USD_WRITTEN, ".usdz")
 CHARACTERS = (*_GLTF, *_USD, ".fbx")
 """Endings of files of characters, that have a rest pose of their own."""
-_MAY_LACK_VALUES = {".bvh": "bvh", ".npz": "npz", ".amc": "acclaim"}
+_MARKERS = {".c3d": "c3d", **dict.fromkeys((".trc", ".csv", ".npy"), "positions")}
+_MAY_LACK_VALUES = {".bvh": "bvh", ".npz": "npz", ".amc": "acclaim", **_MARKERS}
 _TORCH = (".pt", ".pth")
 READERS = {
     **_MAY_LACK_VALUES,
@@ -33,13 +34,14 @@ READERS = {
     ".fbx": "fbx",
 }
 """Endings that are read, each with its module of this package, which is imported when it is needed."""
-_ONLY_READ = (*_TORCH, ".gltf", ".usdz", ".amc")
-MAY_LACK_RATE = (".amc", ".npz", *_TORCH)
+_ONLY_READ = (*_TORCH, *_MARKERS, ".gltf", ".usdz", ".amc")
+MAY_LACK_RATE = (".amc", ".npz", ".csv", ".npy", *_TORCH)
 """Endings of files that need not state their frame rate."""
 WRITERS = {ending: module for ending, module in READERS.items() if ending not in _ONLY_READ} | {".fbx": "fbx_out"}
 """Endings that are written, likewise."""
 _NEEDED = {
     "pxr": "USD needs the package usd-core: pip install 'mapctl[usd]'",
+    "ezc3d": "C3D needs the package ezc3d: pip install 'mapctl[c3d]'",
     "ufbx": "FBX needs the package ufbx: pip install 'mapctl[fbx]'",
 }
 EXAMPLES_LICENCE = "free for any use"
@@ -68,26 +70,31 @@ def resolve_example(path: str | PathLike[str]) -> str | PathLike[str]:
 
 
 def load(
-    path: str | PathLike[str], *, fps: Fraction | float | None = None, metres_per_unit: float | None = None
+    path: str | PathLike[str],
+    *,
+    fps: Fraction | float | None = None,
+    metres_per_unit: float | None = None,
+    markers: str | PathLike[str] | None = None,
 ) -> "Motion":
     """Read a motion from a file of `READERS`, an .amc with the .asf beside it (see `acclaim.read`).
 
     Of a character's file it is an animation, or one frame of the rest pose where there is none; `hero.glb#ARMATURE`,
     `hero.glb#ARMATURE/ANIMATION` and `hero.glb#/ANIMATION` choose where there are several. `fps` is frames per second
-    of an .amc or of SMPL parameters that do not state it; RequestError with the others, which do. `metres_per_unit`
-    wins over what is found by the size of the body, and over what the file declares. `example:NAME` is a motion that
-    mapctl brings along. FileFormatError names the fault of the file, and where: NaN in place of a number, too, which
-    `load_with_missing` takes.
+    of a file of `MAY_LACK_RATE` that does not state it; RequestError with the others, which do. `markers` is a TOML of
+    the markers of joints (see `marker_fit`), for files of positions. `metres_per_unit` wins over what is found by the
+    size of the body, and over what the file declares. `example:NAME` is a motion that mapctl brings along.
+    FileFormatError names the fault of the file, and where: NaN in place of a number, too, which `load_with_missing`
+    takes.
     """
     reader, ending = _find_reader(path), ending_of(path)
     if fps is not None and ending not in MAY_LACK_RATE:
         raise RequestError(f"{path}: a {ending} file has a frame rate of its own; leave the requested one out")
+    options = ({} if fps is None else {"fps": fps}) | _marker_options(path, markers)
     if ending in CHARACTERS:
         from mapctl.formats import character
 
         motion = character.load_motion(path, reader.read_character)
     else:
-        options = {} if fps is None else {"fps": fps}
         motion, _ = reader.read(resolve_example(path), lossy=False, **options)
     return _finish(motion, path, metres_per_unit)
 
@@ -118,7 +125,7 @@ def ending_of(path: str | PathLike[str]) -> str:
 
 
 def load_with_missing(
-    path: str | PathLike[str], *, metres_per_unit: float | None = None
+    path: str | PathLike[str], *, metres_per_unit: float | None = None, markers: str | PathLike[str] | None = None
 ) -> "tuple[Motion, MissingValues]":
     """Read a motion as `load` does, from a file that may have NaN for missing values; also return where they are.
 
@@ -127,12 +134,21 @@ def load_with_missing(
     """
     reader = _find_reader(path)
     if ending_of(path) in _MAY_LACK_VALUES:
-        motion, missing = reader.read(resolve_example(path), lossy=True)
+        motion, missing = reader.read(resolve_example(path), lossy=True, **_marker_options(path, markers))
         return _finish(motion, path, metres_per_unit), missing
     from mapctl.formats.missing import MissingValues
 
-    motion = load(path, metres_per_unit=metres_per_unit)
+    motion = load(path, metres_per_unit=metres_per_unit, markers=markers)
     return motion, MissingValues.none(motion.num_frames, motion.num_joints)
+
+
+def _marker_options(path: str | PathLike[str], markers: str | PathLike[str] | None) -> dict[str, str | PathLike[str]]:
+    """Return the options of a reader of markers; RequestError for a table of markers with another file."""
+    if markers is None:
+        return {}
+    if ending_of(path) not in _MARKERS:
+        raise RequestError(f"{path}: a table of markers is for positions, which are in {', '.join(_MARKERS)}")
+    return {"markers": markers}
 
 
 def _finish(motion: "Motion", path: str | PathLike[str], metres_per_unit: float | None) -> "Motion":
@@ -151,7 +167,7 @@ def _find_reader(path: str | PathLike[str]) -> ModuleType:
     if ending not in READERS:
         asf = "is a skeleton alone: name its motion, a .amc beside it or subject.asf+take.amc"
         pickled = "is a pickle, whose reading runs code: save its poses, trans and mocap_framerate as an .npz"
-        known = {".asf": asf, **dict.fromkeys((".pkl", ".pickle", ".npy"), pickled)}
+        known = {".asf": asf, **dict.fromkeys((".pkl", ".pickle"), pickled)}
         why = known.get(ending, f"cannot read the ending {ending!r}")
         raise FileFormatError(path, f"{why}; allowed: {', '.join(READERS)}")
     try:

@@ -15,6 +15,7 @@ from character_maker import make_character_glb
 from direct_readers import read_directly
 from fbx_maker import make_fbx
 from helpers import make_smpl_parameters, run, walk
+from marker_files import MARKED, write_markers
 
 import mapctl
 from mapctl import editing, formats, retarget
@@ -23,12 +24,13 @@ from mapctl.formats import USD_WRITTEN
 from mapctl.formats.fbx_out import BLENDER
 
 needs_usd = pytest.mark.skipif(not find_spec("pxr"), reason="needs usd-core: pip install 'mapctl[usd]'")
+needs_ezc3d = pytest.mark.skipif(find_spec("ezc3d") is None, reason="needs ezc3d: pip install 'mapctl[c3d]'")
 needs_ufbx = pytest.mark.skipif(find_spec("ufbx") is None, reason="needs ufbx: pip install 'mapctl[fbx]'")
 
 
 def _mark(source, ending):
     """All pairs that have .bvh among them are quick enough together."""
-    needed = {".usd": needs_usd, ".fbx": needs_ufbx}
+    needed = {".usd": needs_usd, ".fbx": needs_ufbx, ".c3d": needs_ezc3d}
     marks = [needed[part[:4]] for part in (source, ending) if part[:4] in needed]
     quick = ".bvh" in (source, ending) and ending != ".fbx"
     marks += [needs_blender] if ending == ".fbx" else []
@@ -60,6 +62,9 @@ def _write_all(folder):
     make_fbx("in.fbx", skin=False, frames=6)
     for name in ("in.pt", "in.pth"):
         torch.save(make_smpl_parameters(6), name)
+    for ending in MARKED:
+        if ending != ".c3d" or find_spec("ezc3d"):
+            write_markers(folder / f"in{ending}", motion)
     if find_spec("pxr"):
         from pxr import UsdUtils
 
@@ -94,7 +99,8 @@ def test_any_format_to_any_format(every_format, capsys, source, ending):
     assert run("convert", f"in{source}", f"out{ending}") == 0
     printed = capsys.readouterr()
     motion = mapctl.load(f"in{source}")
-    assert printed.err == "" or source in (".amc", ".pt", ".pth")  # random angles are doubtful, SMPL has no bones
+    # random angles are doubtful, SMPL has no bones, names of joints are assumed
+    assert printed.err == "" or source in (".amc", ".pt", ".pth", ".npy")
     assert printed.out.startswith(
         f"out{ending}: 6 frames, {motion.num_joints} joints, {float(motion.fps):g} frames a second"
     )

@@ -12,6 +12,7 @@ from acclaim import pair
 from character_maker import make_character_glb
 from direct_readers import read_directly
 from helpers import make_smpl_parameters, random_motion, walk
+from marker_files import MARKED, write_markers
 
 from mapctl import curves, formats
 from mapctl.errors import FileFormatError, MapctlError, RequestError
@@ -23,7 +24,8 @@ from mapctl.skeleton import CANONICAL
 from scenes import scene_file
 
 ROOT = Path(__file__).resolve().parents[2]
-INSTALLED = [e for e in formats.READERS if find_spec({"usd": "pxr", "fbx": "ufbx"}.get(formats.READERS[e], "numpy"))]
+PACKAGES = {"usd": "pxr", "fbx": "ufbx", "c3d": "ezc3d"}
+INSTALLED = [e for e in formats.READERS if find_spec(PACKAGES.get(formats.READERS[e], "numpy"))]
 WRITTEN = [e for e in INSTALLED if e in formats.WRITERS and e not in (".vrm", ".fbx")]  # whose tests need Blender
 TABLES = {
     "steering.csv": (read_commands, "time_s,speed_mps,heading_deg,look_x,look_y,look_z\n0,1.2,0,,,\n2,1,9,1,1,1\n"),
@@ -52,6 +54,8 @@ def make(folder: Path, ending: str) -> Path:
         from fbx_maker import make_fbx
 
         make_fbx(path, frames=3, parts=("shoes",))
+    elif ending in MARKED:
+        write_markers(path, walk(8, fps=60))
     elif ending == ".usdz":
         from pxr import UsdUtils
 
@@ -116,7 +120,7 @@ def test_sound_files_are_read_and_broken_ones_refused_in_a_line_or_read(ending, 
         assert formats.load_rest(path).num_joints == motion.num_joints
         assert ending == ".vrma" or formats.load_mesh(path).joints.max() < motion.num_joints
     raw, random = path.read_bytes(), np.random.default_rng(1)
-    for case in range(2 if ending[:4] in (".usd", ".fbx") else 40):
+    for case in range({".usd": 2, ".fbx": 2, ".c3d": 4}.get(ending[:4], 8 if ending in MARKED else 40)):
         path.write_bytes(mutate(raw, random))
         for read in (formats.load, formats.load_mesh) if ending in formats.CHARACTERS else (formats.load,):
             try:

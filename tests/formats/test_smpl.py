@@ -73,6 +73,7 @@ def test_broken_parameters_are_refused_in_a_line(changed, message, tmp_path):
 
 
 def test_a_pickle_is_refused_with_what_to_do(tmp_path):
+    np.save(tmp_path / "a.npy", np.array({"pose": 1}), allow_pickle=True)
     for name in ("a.pkl", "a.npy"):
         with pytest.raises(FileFormatError, match="save its poses, trans and mocap_framerate as an"):
             formats.load(tmp_path / name)

@@ -62,11 +62,18 @@ def read_rig_clip(text: str, options: ReadOptions | None = None) -> tuple[Motion
 
 
 def read_motion(
-    path: Path, rig: Rig | None, *, fps: Fraction | None = None, body_model: Path | None = None, quiet: bool = False
+    path: Path,
+    rig: Rig | None,
+    *,
+    fps: Fraction | None = None,
+    body_model: Path | None = None,
+    markers: Path | None = None,
+    quiet: bool = False,
 ) -> Motion:
     """Read a motion in metres, by the rig's unit if it has one; `fps` is that of a file that does not state it, and
-    `body_model` gives SMPL parameters their bones. Print doubts unless `quiet`."""
-    motion = formats.load(path, fps=fps, metres_per_unit=None if rig is None else rig.metres_per_unit)
+    `body_model` gives SMPL parameters their bones, `markers` other names of markers. Print doubts unless `quiet`."""
+    unit = None if rig is None else rig.metres_per_unit
+    motion = formats.load(path, fps=fps, metres_per_unit=unit, markers=markers)
     if body_model is not None:
         motion = smpl.fit_bones(motion, body_model)
     elif isinstance(motion.source, smpl.SmplLayout) and not quiet:
@@ -84,9 +91,12 @@ def read_clip(path: Path, options: ReadOptions) -> tuple[Motion, Rig | None]:
     return read_motion(path, rig, quiet=getattr(options, "quiet", False)), rig
 
 
-def read_motion_with_gaps(path: Path, rig: Rig | None, *, quiet: bool) -> tuple[Motion, tuple[Mask, ...], bool]:
+def read_motion_with_gaps(
+    path: Path, rig: Rig | None, *, markers: Path | None = None, quiet: bool
+) -> tuple[Motion, tuple[Mask, ...], bool]:
     """Read a motion in which missing values may be NaN; also return their masks, and whether there are any."""
-    motion, missing = formats.load_with_missing(path, metres_per_unit=None if rig is None else rig.metres_per_unit)
+    unit = None if rig is None else rig.metres_per_unit
+    motion, missing = formats.load_with_missing(path, metres_per_unit=unit, markers=markers)
     _report_reading(path, motion, rig, quiet=quiet)
     return motion, masks_from_missing(motion, missing), bool(missing.rotations.any() or missing.positions.any())
 

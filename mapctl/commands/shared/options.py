@@ -28,6 +28,9 @@ MaybeCurve = Annotated[str | None, arg(metavar="CURVE")]
 MaybeNumber = Annotated[float | None, arg(metavar="NUMBER")]
 MaybeCount = Annotated[int | None, arg(metavar="N")]
 MaybeName = Annotated[str | None, arg(metavar="NAME")]
+_MARKERS = """For positions (.c3d, .trc, .csv, .npy) with names of no known marker set: a TOML that names the markers
+whose mean is a joint's centre, as leftLowerLeg = ["LKNE", "LKNM"]."""
+MaybeMarkers = Annotated[Path | None, arg(metavar="FILE.toml", help=_MARKERS)]
 MaybeRig = Annotated[str | None, arg(metavar="PRESET|FILE.toml|CLIP")]
 MaybeEndpoint = Annotated[str | None, arg(metavar="HOST:PORT")]
 MaybeCharacter = Annotated[str | None, arg(metavar="CHARACTER")]
