@@ -136,10 +136,11 @@ def _check_motion(positions: Float[Tensor, "frames joints 3"]) -> list[Constrain
     worst = measure_worst(positions, 0, CANONICAL.indices(TOES), CANONICAL.indices(FEET), PRIOR_FPS)
     speed = float(positions[:, 0, ::2].diff(dim=0).norm(dim=-1).max()) * PRIOR_FPS
     glide = _GLIDE_CM if speed < _RUNNING else _GLIDE_RUNNING_CM
+    slide = 0.0 if math.isnan(worst["slide_max_cm"]) else worst["slide_max_cm"]  # of feet that never stand
     at = (int(measure_accelerations(positions, PRIOR_FPS).argmax()) + 1) / PRIOR_FPS
     return [
         Constraint("feet", "a step for every displacement", worst["glide_cm"], glide, "cm"),
-        Constraint("soles", "rest while they stand", worst["slide_max_cm"], _SLIDE_CM, "cm"),
+        Constraint("soles", "rest while they stand", slide, _SLIDE_CM, "cm"),
         Constraint("support", "a foot on the ground, or flight", worst["unsupported_max_s"], _UNSUPPORTED, "s"),
         Constraint("ground", "no toe below", worst["depth_max_cm"], _DEPTH_CM, "cm"),
         Constraint("acceleration", f"at {at:.2f} s", worst["acceleration_max_m_s2"], MOST_ACCELERATION, "m/s^2"),

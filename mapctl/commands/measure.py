@@ -134,9 +134,9 @@ class _ClipSet:
     def read(folder: Path, *, with_windows: bool, rig: Rig | None = None) -> "_ClipSet":
         """Read and measure clips of a rig. A file that cannot be read, measured or cut into windows is left out;
         RequestError if none can, and for fewer than a comparison needs."""
-        paths = sorted(p for p in folder.rglob("*") if p.suffix.lower() in formats.READERS and p.is_file())
+        paths = sorted(p for p in folder.rglob("*") if p.suffix.lower() in formats.IN_FOLDERS and p.is_file())
         if not paths:
-            raise RequestError(f"{folder}: no {' or '.join(formats.READERS)} file in this folder or below it")
+            raise RequestError(f"{folder}: no {' or '.join(formats.IN_FOLDERS)} file in this folder or below it")
         found = _ClipSet([], [], {}, [])
         with outputs.show_progress(f"reading {folder}") as progress:
             for number, path in enumerate(paths, start=1):

@@ -34,6 +34,8 @@ READERS = {
     ".fbx": "fbx",
 }
 """Endings that are read, each with its module of this package, which is imported when it is needed."""
+IN_FOLDERS = tuple(ending for ending in READERS if ending not in (*_TORCH, ".csv", ".npy"))
+"""Those of files that are motions in any folder; tables, arrays and tensors may hold anything."""
 _ONLY_READ = (*_TORCH, *_MARKERS, ".gltf", ".usdz", ".amc")
 MAY_LACK_RATE = (".amc", ".npz", ".csv", ".npy", *_TORCH)
 """Endings of files that need not state their frame rate."""

@@ -29,10 +29,8 @@ _ROWS, _WINDOW = 8 * PRIOR_FPS, PRIOR_FPS  # rows by which noise is measured, an
 _MEASURED_ROWS = 15  # fewest by which it is measured, and rows from one measurement to the next
 _HERTZ = (0.7, 1.0, 1.5, 2.0, 3.0, 4.5, 6.5, 10.0, 14.0)  # half-power frequencies of the smoothers, at PRIOR_FPS
 _HIGHEST = 0.47  # of a rate: the highest cutoff that it can hold
-_RISK_SECONDS, _TEMPERATURE = (
-    1.0,
-    0.06,
-)  # sigma over which risks are averaged; smoothers of about equal risk count alike
+_RISK_SECONDS = 1.0  # sigma over which risks are averaged
+_TEMPERATURE = 0.06  # of risks: smoothers of about equal risk count alike
 _LEAST_WEIGHT = 1e-6  # of an unobserved row, so that the system of a column without any has a solution
 _SPIKE_SIGMAS, _LEAST_SPIKE = 6.0, 0.1  # of noise, and radians or metres, that a spike stands out
 _TIMED_FRAMES = 60  # by whose median interval the tracker's rate is measured

@@ -91,10 +91,10 @@ def _collect_jobs(source: Path, out: Path, ending: str | None) -> list[tuple[Pat
     sources = sorted(
         path
         for path in source.rglob("*")
-        if path.suffix.lower() in formats.READERS and inside not in path.resolve().parents
+        if path.suffix.lower() in formats.IN_FOLDERS and inside not in path.resolve().parents
     )
     if not sources:
-        raise RequestError(f"no {' or '.join(formats.READERS)} below {source}")
+        raise RequestError(f"no {' or '.join(formats.IN_FOLDERS)} below {source}")
     given, taken, jobs = {path.resolve() for path in sources}, dict[Path, Path](), list[tuple[Path, Path]]()
     for path in sources:
         own = path.suffix if path.suffix.lower() in formats.WRITERS else ".bvh"
