@@ -410,7 +410,7 @@ def _drifts(motion: Motion) -> bool:
     quats = smooth_columns(motion.local_quat_xyzw, weights, _DRIFT_HERTZ, fps)
     root = smooth_columns(motion.root_position[:, None], weights[:, :1], _DRIFT_HERTZ, fps)[:, 0]
     smooth = replace(motion, root_position=root, local_quat_xyzw=torch.nn.functional.normalize(quats, dim=-1))
-    return correct_trajectory(smooth.resample(PRIOR_FPS)).is_video
+    return correct_trajectory(smooth.resample(PRIOR_FPS)).from_video
 
 
 _DRIFT_HERTZ = 3.0  # half-power frequency of what is not tremor

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy import ndarray
-from scipy import linalg, ndimage, special
+from scipy import ndimage, sparse, special
 
 from mapctl import rotations
 from mapctl.contacts import REST_SPEED, TOE_LEVEL, compute_rest_log_probability
@@ -19,7 +19,9 @@ from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, TOES, leg_length
 
 _CAPTURED_DRIFT, _STANCE_SECONDS = 0.12, 1.5  # m/s below which captured hips drift, and stance that shows it
+_LEVEL_RANGE = 0.5  # metres by which the floor of an estimate from video drifts: a climber's has more
 _CORRELATION_SECONDS = 0.2  # time over which the drift's velocity is correlated
+_EVEN_SECONDS = 0.06  # the drift's velocity over its acceleration: less leaves kinks where toes land and leave
 _LEAST_DRIFT = 0.01  # m/s
 _SINK_SPEED, _SINK_HEIGHT = 0.1, 0.5  # m/s by which, and metres to which, heights drift
 _SWING_HEIGHT = 0.3  # metres over the floor within which a toe swings
@@ -36,17 +38,9 @@ class CorrectedTrajectory:
     motion: Motion
     drift: float
     """Standard deviation of the velocity, m/s, at which standing toes slid."""
-    steady: float
-    """Speed, m/s, of their mean velocity in the body's own frame: high under a walk in place, or feet that land and
-    leave fast."""
-
-    seconds: float
-    """Time for which either toe stands."""
-
-    @property
-    def is_video(self) -> bool:
-        """Whether the hips drift about the toes, rather than travel steadily over them, faster than captured ones."""
-        return self.seconds >= _STANCE_SECONDS and self.drift >= _CAPTURED_DRIFT and self.steady < self.drift / 2
+    from_video: bool
+    """Whether toes stand for long enough, on about one level, and slide faster than captured ones do, but not steadily
+    in the body's own frame as under a walk in place, or where feet land and leave fast."""
 
 
 def correct_trajectory(motion: Motion) -> CorrectedTrajectory:
@@ -55,8 +49,8 @@ def correct_trajectory(motion: Motion) -> CorrectedTrajectory:
     Coordinates x of the hips minimise the sum over frames of w (dx + df)^2 / s_rest^2 + (dx - do)^2 / s^2 + (x - o)^2 /
     s_0^2, with captured hips o, toes f about the hips, and weights w, the probability that a toe stands: slow, below
     the hips and low. The drift s is estimated from the velocity of standing toes (empirical Bayes), so that hips over
-    toes that are still stay; s_0 is s over its time of correlation. Heights have w (x + f - r)^2 / s_level^2 in
-    addition, r the height at which toes rest.
+    toes that are still stay; s_0 is s over its time of correlation, and the drift x - o has an acceleration in
+    proportion. Heights have w (x + f - r)^2 / s_level^2 in addition, r the height at which toes rest.
     """
     fps, hips = float(motion.fps), motion.root_position.numpy()
     toes = motion.joint_positions()[:, motion.skeleton.indices(TOES)].numpy()
@@ -77,13 +71,13 @@ def correct_trajectory(motion: Motion) -> CorrectedTrajectory:
         drift = max(_LEAST_DRIFT, math.sqrt(max(0.0, drift**2 - REST_SPEED**2)))
         prior = (drift, _CORRELATION_SECONDS * drift)
         ground = _solve(captured[:, [0, 2]], about[..., [0, 2]], stands, fps, prior)
-        levels = standing / TOE_LEVEL**2, rest - about[..., 1]
+        levels = standing / TOE_LEVEL**2, rest - about[..., 1:2]
         height = _solve(captured[:, 1:2], about[..., 1:2], stands, fps, (_SINK_SPEED, _SINK_HEIGHT), levels)
         found = np.stack([ground[:, 0], height[:, 0], ground[:, 1]], axis=1)
-    steady = (stands[..., None] * slide).sum(axis=(0, 1)) / max(stands.sum(), 1e-9)
-    corrected = torch.from_numpy(found).to(motion.root_position)
-    seconds = float(stands.max(axis=1).sum()) / fps
-    return CorrectedTrajectory(replace(motion, root_position=corrected), drift, float(np.hypot(*steady)), seconds)
+    steady = np.linalg.norm((stands[..., None] * slide).sum(axis=(0, 1))) / max(float(stands.sum()), 1e-9)
+    shows = stands.max(axis=1).sum() > _STANCE_SECONDS * fps and np.ptp(floor) < _LEVEL_RANGE
+    corrected = replace(motion, root_position=torch.from_numpy(found).to(motion.root_position))
+    return CorrectedTrajectory(corrected, drift, bool(shows and drift > _CAPTURED_DRIFT and steady < drift / 2))
 
 
 def _weigh_standing(
@@ -103,25 +97,28 @@ def _solve(
     stands: Float[ndarray, "steps 2"],
     fps: float,
     prior: tuple[float, float],
-    levels: tuple[Float[ndarray, "frames 2"], Float[ndarray, "frames 2"]] | None = None,
+    levels: tuple[Float[ndarray, "frames 2"], Float[ndarray, "frames 2 axes"]] | None = None,
 ) -> Float[ndarray, "frames axes"]:
-    """Solve the tridiagonal system of coordinates of the hips; `prior` is the standard deviation of the drift's
-    velocity, m/s, and of its size, metres, `levels` weights and values of coordinates of the hips that toes show."""
-    speed, size = prior
-    still, steady = stands * (fps / REST_SPEED) ** 2, (fps / speed) ** 2
-    weight = still.sum(axis=1) + steady
-    pulled = steady * np.diff(captured, axis=0) - (still[..., None] * np.diff(about, axis=0)).sum(axis=1)
-    bands, right = np.zeros((2, len(captured))), captured / size**2
-    bands[1] = 1 / size**2
+    """Solve the sparse system of coordinates of the hips; `prior` is the standard deviation of the drift's velocity,
+    m/s, and of its size, metres, `levels` weights and values of coordinates of the hips that toes show."""
+    frames, (speed, size) = len(captured), prior
+    step = _build_differences(frames - 1)
+    bend = _build_differences(frames - 2) @ step
+    still = stands * (fps / REST_SPEED) ** 2
+    weights, right = np.full(frames, 1 / size**2), np.zeros_like(captured)
     if levels is not None:
-        bands[1] += levels[0].sum(axis=1)
-        right += (levels[0] * levels[1]).sum(axis=1)[:, None]
-    bands[1, :-1] += weight
-    bands[1, 1:] += weight
-    bands[0, 1:] = -weight
-    right[1:] += pulled
-    right[:-1] -= pulled
-    return linalg.solveh_banded(bands, right)
+        weights += levels[0].sum(axis=1)
+        right += (levels[0][..., None] * (levels[1] - captured[:, None])).sum(axis=1)
+    right -= step.T @ (still[..., None] * np.diff(captured[:, None] + about, axis=0)).sum(axis=1)
+    smooth = step.T @ sparse.diags_array(still.sum(axis=1) + (fps / speed) ** 2) @ step
+    even = np.full(frames - 2, (_EVEN_SECONDS * fps**2 / speed) ** 2)
+    system = smooth + bend.T @ sparse.diags_array(even) @ bend + sparse.diags_array(weights)
+    drift = sparse.linalg.spsolve(sparse.csc_array(system), right)
+    return captured + drift.reshape(captured.shape)
+
+
+def _build_differences(rows: int) -> sparse.csr_array:
+    return sparse.csr_array(sparse.eye_array(rows, rows + 1, k=1) - sparse.eye_array(rows, rows + 1))
 
 
 def _weighted_median(values: Float[ndarray, "steps 2"], weights: Float[ndarray, "steps 2"]) -> float:

@@ -404,9 +404,9 @@ def test_a_body_that_drifts_and_floats_is_put_on_the_floor_by_its_feet():
     assert before[2] > 0.1
     assert after[2] < 0.4 * before[2]
     assert max(studio[:2]) < 0.005
-    assert corrected.is_video
-    assert not unchanged.is_video
-    assert not in_place.is_video
+    assert corrected.from_video
+    assert not unchanged.from_video
+    assert not in_place.from_video
     lower = corrected.motion.joint_positions()[:, toes, 1].amin(dim=1)
     assert TOE_REST_HEIGHT - 0.01 < float(lower.median()) < TOE_REST_HEIGHT + 0.04
 
