@@ -40,9 +40,13 @@ class CausalDenoiser:
         `past` seconds before; `rig` overrides recognition."""
         if not 1 / PRIOR_FPS <= delay <= _MAX_DELAY:
             raise RequestError(f"the delay must be {1 / PRIOR_FPS:.2f} to {_MAX_DELAY:g} s, got {delay:g}")
-        self._denoiser, self._settings, self._rig = denoiser, settings or DenoiseSettings(), rig
-        if self._settings.only_faults:
-            raise RequestError("faults are found in the whole capture: leave only faults or causal denoising out")
+        settings = settings or DenoiseSettings()
+        if settings.only_faults or settings.capture == "video":
+            asked = "faults are" if settings.only_faults else "the floor of a capture from video is"
+            raise RequestError(
+                f"{asked} found in the whole capture, which a causal run never sees; leave one of them out"
+            )
+        self._denoiser, self._settings, self._rig = denoiser, replace(settings, capture="studio"), rig
         self._rig_identified = False  # from the capture's beginning, which later passes do not see
         self.delay, self._history = delay, past
         self._past: Motion | None = None  # frames that a pass sees

@@ -81,27 +81,21 @@ def _fill(capture: Motion, clean: Motion, false: MissingMask) -> Motion:
 
 def _plant_feet(motion: Motion, rig: Rig | None) -> Motion:
     """Hold the feet that slide, float or penetrate. Left as they are: slides of a toe that stands on both sides of it,
-    at two positions, and faults that stay faults or whose repair is less smooth than all of the motion."""
+    at two positions, and faults that stay faults."""
     footing = Footing.of(motion, rig)
     faults = [fault for fault in footing.list_artefacts() if fault.kind != "slide" or not all(_stands(footing, fault))]
-    roughest, fade = float(_measure_roughness(motion).max()), round(FADE_SECONDS * float(motion.fps))
+    fade = round(FADE_SECONDS * float(motion.fps))
     while faults:
         planted = _hold_toes(motion, footing, faults)
-        rough, still = _measure_roughness(planted) > roughest, Footing.of(planted, rig).list_artefacts()
-        kept = []
+        still, kept = Footing.of(planted, rig).list_artefacts(), []
         for fault in faults:
             start, stop = max(0, fault.start - fade), fault.stop + fade
             again = any(one.joint == fault.joint and one.start < stop and start < one.stop for one in still)
-            kept += [] if again or bool(rough[start:stop].any()) else [fault]
+            kept += [] if again else [fault]
         if len(kept) == len(faults):
             return planted
         faults = kept
     return motion
-
-
-def _measure_roughness(motion: Motion) -> Float[Tensor, " frames"]:
-    """Measure the largest third difference of any joint about each frame, metres."""
-    return motion.joint_positions().diff(n=3, dim=0, prepend=motion.joint_positions()[:3]).norm(dim=-1).amax(dim=-1)
 
 
 def _stands(footing: Footing, fault: Artefact) -> tuple[bool, bool]:

@@ -24,6 +24,7 @@ _CORRELATION_SECONDS = 0.2  # time over which the drift's velocity is correlated
 _EVEN_SECONDS = 0.06  # the drift's velocity over its acceleration: less leaves kinks where toes land and leave
 _LEAST_DRIFT = 0.01  # m/s
 _SINK_SPEED, _SINK_HEIGHT = 0.1, 0.5  # m/s by which, and metres to which, heights drift
+_REST_RANGE = 0.06  # metres by which toes of other rigs rest higher or lower: there the capture's own height stays
 _SWING_HEIGHT = 0.3  # metres over the floor within which a toe swings
 _FLOOR_SECONDS, _FLOOR_PERCENTILE = 1.2, 15  # of the lower toe's height: the floor of the first solve
 _VELOCITY_ERRORS = (0.3, 0.2, 0.12, 0.08, 0.05, 0.05)
@@ -52,12 +53,16 @@ def correct_trajectory(motion: Motion) -> CorrectedTrajectory:
     toes that are still stay; s_0 is s over its time of correlation, and the drift x - o has an acceleration in
     proportion. Heights have w (x + f - r)^2 / s_level^2 in addition, r the height at which toes rest.
     """
+    if motion.num_frames < 3:
+        return CorrectedTrajectory(motion, 0.0, from_video=False)
     fps, hips = float(motion.fps), motion.root_position.numpy()
     toes = motion.joint_positions()[:, motion.skeleton.indices(TOES)].numpy()
     about, lower = toes - hips[:, None], toes[..., 1].min(axis=1)
     rest = TOE_REST_HEIGHT * leg_length(motion.skeleton) / leg_length(CANONICAL)
     window = 2 * round(_FLOOR_SECONDS * fps / 2) + 1
     floor = ndimage.percentile_filter(lower, _FLOOR_PERCENTILE, window, mode="nearest")
+    if abs(np.median(floor) - rest) < _REST_RANGE:
+        rest = float(np.median(floor))
     found = hips + np.outer(rest - floor, (0, 1, 0))
     captured = hips + np.array([0, rest - np.median(floor), 0])
     heading = rotations.split_heading(motion.local_quat_xyzw[1:, 0])[0]

@@ -40,7 +40,7 @@ class Denoise(ModelCommand, options.RigOptions):
     capture: CaptureKind = "auto"
     """`video`: move the hips so that standing toes neither slide nor leave the floor at y = 0, for estimates from
     video, whose body drifts and floats. `studio`: the trajectory is as good as the pose. `auto`: as video where
-    standing toes slide faster than captured ones do, but not under a walk in place."""
+    standing toes slide faster than captured ones do, but not under a walk in place. --causal keeps the trajectory."""
     only_faults: bool = False
     """Repair only the faults that `mapctl measure` lists, but for noise and smoothing: all other frames and joints stay
     to the bit. A foot at fault changes legs and hips from 0.3 s before it to 0.3 s after."""
@@ -68,7 +68,7 @@ class Denoise(ModelCommand, options.RigOptions):
     """For a folder: denoise files again whose result exists already."""
     strict: bool = False
     """Exit with status 3 where not all that was requested holds: the network was out of its depth for more than half of
-    the frames."""
+    the frames, or with --only-faults a fault is left."""
     quiet: options.Quiet = False
 
     @property

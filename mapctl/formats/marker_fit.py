@@ -243,7 +243,7 @@ def _check_joints(path: str | PathLike[str], landmarks: list[Landmark]) -> None:
     """Raise FileFormatError where the joints of the legs have no markers; hips may have three on the pelvis."""
     pelvis = [np.sign(mark.at[0]) for mark in landmarks if mark.on == mark.of == 0 and mark.sigma < _FREE_SIGMA]
     pelvis = len(pelvis) > 2 and {-1, 1} <= set(pelvis)
-    known = {_NAMES[landmark.of] for landmark in landmarks if landmark.on != landmark.of}
+    known = {_NAMES[mark.of] for mark in landmarks if mark.on != mark.of and mark.sigma < _FREE_SIGMA}
     lacking = [joint for joint in _NEEDED if joint not in known and not (pelvis and joint.endswith("UpperLeg"))]
     if lacking:
         raise FileFormatError(

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mapctl.errors import FileFormatError
+from mapctl.errors import FileFormatError, RequestError
 from mapctl.formats.missing import MissingValues
 from mapctl.formats.text import LARGEST_VALUE, check_extent, decode, one_line, read_bytes, shorten, warn_once
 from mapctl.formats.units import FASTEST, SLOWEST
@@ -131,7 +131,7 @@ def _parse_rows(path: str | PathLike[str], rows: list[list[str]], columns: np.nd
             values[number] = [float(word) if word else np.nan for word in words]
         except ValueError as error:
             raise FileFormatError(path, f"{one_line(error)}, expected numbers", line + number) from None
-    positions = values.reshape(len(rows), -1, 3)
+    positions = values.reshape(len(rows), len(columns) // 3, 3)
     positions[(positions == 0).all(axis=2)] = np.nan
     return positions
 
@@ -154,7 +154,9 @@ def _read_csv(path: str | PathLike[str], fps: Fraction | float | None) -> Captur
             path, "is no CSV of positions: expected columns name.x, name.y, name.z, or X, Y, Z under names"
         )
     above = dict(itertools.pairwise(word.strip().lower() for row in header for word in row))
-    rate = fps or _find_rate(header, body) or 0.0
+    stated = _find_rate(header, body)
+    _check_one_rate(path, fps, stated)
+    rate = fps or stated or 0.0
     if not rate:
         warn_once(
             f"{path}: states no frame rate: {_ASSUMED_FPS} a second are assumed; --fps-in of mapctl convert sets it"
@@ -163,6 +165,11 @@ def _read_csv(path: str | PathLike[str], fps: Fraction | float | None) -> Captur
     unit = above.get("length units", unit)
     positions = _parse_rows(path, body, np.array(columns), offset + first + 1)
     return build_capture(path, names, positions, float(rate or _ASSUMED_FPS), unit)
+
+
+def _check_one_rate(path: str | PathLike[str], fps: Fraction | float | None, stated: float | None) -> None:
+    if fps is not None and stated:
+        raise RequestError(f"{path}: states {stated:g} frames a second itself; leave --fps-in out")
 
 
 def _is_number(words: list[str]) -> bool:
@@ -245,7 +252,8 @@ def _read_npy(path: str | PathLike[str], fps: Fraction | float | None) -> Captur
     notes = []
     if names is None:
         found = [name for name, joints in SETS.items() if len(joints) == values.shape[1]]
-        found.sort(key=lambda name: _measure_flexing(values, SETS[name]))
+        if len(found) > 1 and len(values):
+            found.sort(key=lambda name: _measure_flexing(values, SETS[name]))
         if not found:
             known = ", ".join(f"{len(joints)} ({name})" for name, joints in SETS.items())
             raise FileFormatError(
@@ -256,6 +264,7 @@ def _read_npy(path: str | PathLike[str], fps: Fraction | float | None) -> Captur
         notes.append(f"its {len(names)} joints are taken for those of {found[0]}")
     if len(names) != values.shape[1]:
         raise FileFormatError(path, f"has {values.shape[1]} joints, and the file of names beside it {len(names)}")
+    _check_one_rate(path, fps, rate)
     rate = fps or rate
     if not rate:
         notes.append(f"{_ASSUMED_FPS} frames a second are assumed; --fps-in of mapctl convert sets them")

@@ -173,7 +173,10 @@ def read(
     if found is None:
         raise FileFormatError(path, f"holds no SMPL parameters: tensors named {' or '.join(POSES)}")
     found, up = (found[_GLOBAL], _AS_IS) if _GLOBAL in found else (found, None)
-    arrays = {key: _to_array(value) for key, value in found.items() if key in KEYS}
+    try:
+        arrays = {key: _to_array(value) for key, value in found.items() if key in KEYS}
+    except (TypeError, ValueError, RuntimeError) as error:  # sparse, or lists of unequal lengths
+        raise FileFormatError(path, f"holds what is no tensor of numbers: {one_line(error)}") from error
     motion = build_motion(path, arrays, fps=fps, upright=up)
     return motion, MissingValues.none(motion.num_frames, motion.num_joints)
 

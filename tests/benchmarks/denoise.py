@@ -1,4 +1,5 @@
-"""Denoising beside filters: joint errors of clips with noise (5 degrees, 2 cm, 1 % spikes), and of clean clips.
+"""Denoising beside filters: joint errors of clips with noise (5 degrees, 2 cm, 1 % spikes), of clips that tremble and
+drift as estimates from video, and of clean clips.
 
 `--model` is a denoiser. Filters are tuned on the truth: the best cut-off of a Butterworth filter (fourth order, forward
 and backward), the best window of a Savitzky-Golay filter (third order). Of clean clips the input is the truth, and the
@@ -7,7 +8,7 @@ error is the change.
 
 import torch
 from common import compare_methods, load_circles, map_motion, measure_error, parse, print_table
-from corruptions import add_noise
+from corruptions import add_noise, add_video_noise
 from scipy.signal import butter, savgol_filter, sosfiltfilt
 from torch import Tensor
 
@@ -41,20 +42,25 @@ def main(words: list[str] | None = None) -> None:
 
     def measure(truth: Motion, generator: torch.Generator) -> dict[str, dict[str, float]]:
         noisy = add_noise(truth, generator, degrees=5.0, centimetres=2.0)
-        half = float(truth.fps) / 2
-        butterworth = [filter_butterworth(noisy, hertz) for hertz in CUTOFFS if hertz < half]
-        savitzky = [filter_savitzky_golay(noisy, window) for window in WINDOWS]
-        found = {}
-        for case, capture, filters in (
-            ("noise", noisy, {"Butterworth, tuned": butterworth, "Savitzky-Golay, tuned": savitzky}),
-            ("clean", truth, {}),
-        ):
+        video = add_video_noise(truth, generator)
+        half, found = float(truth.fps) / 2, {}
+        for case, capture in (("noise", noisy), ("video", video), ("clean", truth)):
+            filters = {
+                "Butterworth, tuned": [filter_butterworth(capture, hertz) for hertz in CUTOFFS if hertz < half],
+                "Savitzky-Golay, tuned": [filter_savitzky_golay(capture, window) for window in WINDOWS],
+            }
+            if case == "clean":
+                filters = {}
             done = controllers.denoise(capture, denoiser, inbetweener=inbetweener).motion
             errors = {"input": measure_error(truth, capture)}
             errors |= {name: min(measure_error(truth, each) for each in tried) for name, tried in filters.items()}
             # A leading T-pose would be cut: compare the frames that are left.
             cut = truth.slice(truth.num_frames - done.num_frames, truth.num_frames)
             found[case] = errors | {"mapctl denoise": measure_error(cut, done)}
+            if case == "video":
+                studio = controllers.DenoiseSettings(capture="studio")
+                done = controllers.denoise(capture, denoiser, inbetweener=inbetweener, settings=studio).motion
+                found[case]["mapctl denoise --capture studio"] = measure_error(cut, done)
         return found
 
     print_table(compare_methods(circles, measure, seed=given.seed, simple="input"), circles)

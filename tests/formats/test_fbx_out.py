@@ -166,7 +166,7 @@ def test_without_blender_a_line_has_the_remedy(tmp_path, monkeypatch, capsys):
     monkeypatch.delenv(fbx_out.BLENDER, raising=False)
     (tmp_path / "takes").mkdir()
     make_fbx(tmp_path / "takes" / "a.fbx", frames=2)
-    for words in (("in.bvh", "out.fbx"), ("takes", "out")):
+    for words in (("in.bvh", "out.fbx"), ("takes", "out", "--to", ".fbx")):
         assert run("convert", *words) == 2
         assert "install it from blender.org and put its program on PATH" in capsys.readouterr().err
     monkeypatch.setenv(fbx_out.BLENDER, "nowhere/blender")

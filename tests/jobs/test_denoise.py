@@ -12,6 +12,7 @@ from helpers import generator, walk
 from performers import Performer
 from tiny_denoiser import QUICK, tiny_denoiser
 
+from controllers.denoising.causal import denoise_causal
 from controllers.denoising.denoise import LostPartFiller, denoise
 from controllers.denoising.solution import join_segments
 from controllers.denoising.trajectory import correct_trajectory
@@ -432,5 +433,11 @@ def test_an_estimate_from_video_is_noticed_and_its_tremor_removed():
     assert smooth < 0.3 * rough
     for capture in (walk, noisy(walk, degrees=1.0, centimetres=0.3)):
         assert denoise(capture, tiny_denoiser(), settings=QUICK).drift is None
+    for capture in (video.slice(0, 1), video.slice(0, 10)):
+        for given in (QUICK, replace(QUICK, only_faults=True)):
+            assert denoise(capture, tiny_denoiser(), settings=given).motion.num_frames == capture.num_frames
+    causal = denoise_causal(video, tiny_denoiser(), settings=QUICK, delay=0.2).motion
+    away = (causal.root_position - video.root_position).norm(dim=-1)
+    assert float(away.max()) < 0.1  # no floor is found on the way
     studio = replace(QUICK, capture="studio")
     assert denoise(video, tiny_denoiser(), settings=studio).drift is None

@@ -97,7 +97,7 @@ def _collect_jobs(source: Path, out: Path, ending: str | None) -> list[tuple[Pat
         raise RequestError(f"no {' or '.join(formats.IN_FOLDERS)} below {source}")
     given, taken, jobs = {path.resolve() for path in sources}, dict[Path, Path](), list[tuple[Path, Path]]()
     for path in sources:
-        own = path.suffix if path.suffix.lower() in formats.WRITERS else ".bvh"
+        own = path.suffix if path.suffix.lower() in formats.WRITERS and path.suffix.lower() != ".fbx" else ".bvh"
         result = out / path.relative_to(source).with_suffix(ending or own)
         formats.check_ending(result)
         if (other := taken.setdefault(result, path)) != path:
