@@ -35,6 +35,7 @@ from mapctl.motion import Motion
 from mapctl.numerics.intervals import true_intervals
 from mapctl.pose import BodyPose
 from mapctl.problem.solution import Ledger, Outcome, Status
+from mapctl.problem.unknowns import SMOOTH_FRAMES
 from mapctl.protocols import Denoiser, Density, Inbetweener
 from mapctl.recording import Capture, CaptureProposal
 from mapctl.recording.fusion import (
@@ -218,7 +219,7 @@ def _denoise_segment(
     observation = _Observation.of(inspection, settings, rig)
     proposal, contacts, spread = _propose(observation, denoiser)
     fused, share, error = _fuse(observation, proposal)
-    from_video = settings.capture == "video" or (settings.capture == "auto" and _drifts(fused))
+    from_video = settings.capture == "video" or (settings.capture == "auto" and _drifts(fused, error))
     if from_video:
         observation = observation.with_noise(settings, slow=True)
         fused, share, error = _fuse(observation.completed(proposal), None)
@@ -404,13 +405,16 @@ def _propose(
     return motion, follow(cleaned.contact_logits[0]), follow(cleaned.log_spread[0, :, 1:].double()).exp()
 
 
-def _drifts(motion: Motion) -> bool:
-    """Return whether standing toes slide as in estimates from video, tremor aside."""
+def _drifts(motion: Motion, error: Float[Tensor, "frames joints"]) -> bool:
+    """Return whether standing toes slide as in estimates from video, tremor aside, and faster than the errors of the
+    angles, radians, explain: those are smooth over SMOOTH_FRAMES."""
     fps, weights = float(motion.fps), torch.ones(motion.num_frames, motion.num_joints, dtype=torch.float64)
     quats = smooth_columns(motion.local_quat_xyzw, weights, _DRIFT_HERTZ, fps)
     root = smooth_columns(motion.root_position[:, None], weights[:, :1], _DRIFT_HERTZ, fps)[:, 0]
     smooth = replace(motion, root_position=root, local_quat_xyzw=torch.nn.functional.normalize(quats, dim=-1))
-    return correct_trajectory(smooth.resample(PRIOR_FPS)).from_video
+    away = float(error.square().mean().sqrt()) * leg_length(motion.skeleton)
+    explained = away * PRIOR_FPS / (math.sqrt(2) * SMOOTH_FRAMES)  # as the derivative of errors so correlated
+    return correct_trajectory(smooth.resample(PRIOR_FPS), explained).from_video
 
 
 _DRIFT_HERTZ = 3.0  # half-power frequency of what is not tremor

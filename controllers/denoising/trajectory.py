@@ -44,8 +44,9 @@ class CorrectedTrajectory:
     in the body's own frame as under a walk in place, or where feet land and leave fast."""
 
 
-def correct_trajectory(motion: Motion) -> CorrectedTrajectory:
-    """Find the hips under which the standing toes of a canonical motion are still, on the floor at y = 0.
+def correct_trajectory(motion: Motion, explained: float = 0.0) -> CorrectedTrajectory:
+    """Find the hips under which the standing toes of a canonical motion are still, on the floor at y = 0; `explained`
+    is the drift, m/s, that errors of its pose alone would show.
 
     Coordinates x of the hips minimise the sum over frames of w (dx + df)^2 / s_rest^2 + (dx - do)^2 / s^2 + (x - o)^2 /
     s_0^2, with captured hips o, toes f about the hips, and weights w, the probability that a toe stands: slow, below
@@ -82,7 +83,9 @@ def correct_trajectory(motion: Motion) -> CorrectedTrajectory:
     steady = np.linalg.norm((stands[..., None] * slide).sum(axis=(0, 1))) / max(float(stands.sum()), 1e-9)
     shows = stands.max(axis=1).sum() > _STANCE_SECONDS * fps and np.ptp(floor) < _LEVEL_RANGE
     corrected = replace(motion, root_position=torch.from_numpy(found).to(motion.root_position))
-    return CorrectedTrajectory(corrected, drift, bool(shows and drift > _CAPTURED_DRIFT and steady < drift / 2))
+    return CorrectedTrajectory(
+        corrected, drift, bool(shows and drift > math.hypot(_CAPTURED_DRIFT, explained) and steady < drift / 2)
+    )
 
 
 def _weigh_standing(

@@ -441,3 +441,10 @@ def test_an_estimate_from_video_is_noticed_and_its_tremor_removed():
     assert float(away.max()) < 0.1  # no floor is found on the way
     studio = replace(QUICK, capture="studio")
     assert denoise(video, tiny_denoiser(), settings=studio).drift is None
+
+
+def test_white_noise_that_a_filter_leaves_is_no_drift_of_video():
+    """As large as the errors of the angles explain."""
+    drifting = wobbling(Performer().walks(240))
+    assert correct_trajectory(drifting).from_video
+    assert not correct_trajectory(drifting, explained=0.4).from_video
