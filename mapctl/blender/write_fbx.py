@@ -19,8 +19,6 @@ from mapctl.blender.addon.body import Y_UP
 from mapctl.blender.addon.exchange import join_signs, to_quaternions, transpose
 from mapctl.blender.addon.process import AddonError
 
-REFUSED = 3
-"""Exit status where the last line of standard error is a reason for the user."""
 _CENTIMETRES = 100.0
 _UP = np.array([0.0, 5.0, 0.0])  # a bone of a joint, centimetres; one along Y is aligned with the world
 _MOST_FPS = 32767
@@ -202,5 +200,5 @@ if __name__ == "__main__":
         write(arrays, Path(sys.argv[-1]).parent)
     except (AddonError, RuntimeError) as error:  # the latter of Blender's operators
         print(" ".join(str(error).split()), file=sys.stderr, flush=True)
-        os._exit(REFUSED)
+        os._exit(1)
     os._exit(0)  # Blender may crash as it is taken down

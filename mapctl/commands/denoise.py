@@ -89,8 +89,7 @@ def run(command: Denoise) -> int:
         raise RequestError("--capture video finds the floor from the whole capture; leave it or --causal out")
     if command.causal and command.only_faults:
         raise RequestError("--only-faults finds faults in the whole capture; leave it or --causal out")
-    if command.only_faults and command.capture == "video":
-        raise RequestError("--only-faults leaves the trajectory that --capture video corrects; leave one of them out")
+    _ = command.settings  # refuses before models are loaded
     if command.causal and command.inbetweener is not None:
         raise RequestError("--causal leaves what is lost to the denoiser; leave --inbetweener out")
     if command.delay is not None and not command.causal:

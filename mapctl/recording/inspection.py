@@ -75,13 +75,13 @@ def list_artefacts(
     names: Sequence[str],
     wrong: Bool[Tensor, "frames columns"],
     kind: str,
-    unit: str = "",
-    amounts: Float[Tensor, "frames columns"] | None = None,
+    unit: str,
+    amounts: Float[Tensor, "frames columns"],
     total: Callable[[Tensor], Tensor] = torch.max,
 ) -> list[Artefact]:
     """List runs of frames by column, each with the largest of its amounts, or their `total`."""
     return [
-        Artefact(names[k], start, stop, kind, 0.0 if amounts is None else float(total(amounts[start:stop, k])), unit)
+        Artefact(names[k], start, stop, kind, float(total(amounts[start:stop, k])), unit)
         for k, start, stop in true_intervals(wrong)
     ]
 
