@@ -18,7 +18,7 @@ from mapctl.contacts import REST_SPEED, TOE_LEVEL, compute_rest_log_probability
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, TOES, leg_length
 
-_CAPTURED_DRIFT, _STANCE_SECONDS = 0.12, 1.5  # m/s below which captured hips drift, and stance that shows it
+_CAPTURED_DRIFT, _STANCE_SECONDS = 0.09, 1.5  # m/s below which captured hips drift, and stance that shows it
 _LEVEL_RANGE = 0.5  # metres by which the floor of an estimate from video drifts: a climber's has more
 _CORRELATION_SECONDS = 0.2  # time over which the drift's velocity is correlated
 _EVEN_SECONDS = 0.06  # the drift's velocity over its acceleration: less leaves kinks where toes land and leave
