@@ -63,7 +63,8 @@ def _unknown_joint_error(skeleton: Skeleton, role: str) -> RequestError:
 def classify_joints(skeleton: Skeleton) -> tuple[Role, ...]:
     """Classify the role of every joint, settled by what else the rig has.
 
-    Where there are collars, a `shoulder` is the upper arm; without thighs, a hip with a side is one.
+    Where there are collars, a `shoulder` is the upper arm; without thighs, a hip with a side is one; without a head,
+    the last of several neck joints is one.
     """
     found = [classify_joint(name) for name in skeleton.names]
     collars = any(re.search("collar|clavicle", name, re.IGNORECASE) for name in skeleton.names)
@@ -74,4 +75,7 @@ def classify_joints(skeleton: Skeleton) -> tuple[Role, ...]:
             found[joint] = Role(side, Part.UPPER_ARM)
         if not thighs and part is Part.HIPS and side is not Side.MIDDLE:
             found[joint] = Role(side, Part.UPPER_LEG)
+    necks = [joint for joint, role in enumerate(found) if role == Role(Side.MIDDLE, Part.NECK)]
+    if len(necks) > 1 and not skeleton.children(necks[-1]) and all(role.part is not Part.HEAD for role in found):
+        found[necks[-1]] = Role(Side.MIDDLE, Part.HEAD)
     return tuple(found)

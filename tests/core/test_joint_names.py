@@ -141,3 +141,12 @@ def test_a_shoulder_below_a_collar_is_the_upper_arm_and_a_hip_without_thigh_the_
         Part.UPPER_ARM,
         Part.LOWER_ARM,
     ]
+
+
+@pytest.mark.parametrize(
+    ("names", "last"), [(("Neck", "Neck1"), Part.HEAD), (("Neck", "Head"), Part.HEAD), (("Neck",), Part.NECK)]
+)
+def test_the_last_of_several_neck_joints_is_the_head_of_a_rig_without_one(names, last):
+    count = len(names) + 1
+    skeleton = Skeleton(("Hips", *names), tuple(range(-1, count - 1)), walk().skeleton.offsets[:count])
+    assert [role.part for role in classify_joints(skeleton)][1:] == [*(Part.NECK for _ in names[1:]), last]
