@@ -1,6 +1,6 @@
 """`mapctl convert`: any format to any format, other bones, another frame rate, and edits that everybody needs."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from time import perf_counter
@@ -14,11 +14,18 @@ from mapctl.commands.shared.command import Command
 from mapctl.editing.rigged_motion import RiggedMotion
 from mapctl.errors import RequestError
 from mapctl.formats import smpl
+from mapctl.features import PRIOR_FPS
+from mapctl.kinematics.moving import rotate_world
 from mapctl.metrics import feet
 from mapctl.motion import Motion
 from mapctl.retarget import as_rig, identify_rig
 from mapctl.retarget.carry import Changes, RiggedCharacter, retarget_motion
 from mapctl.retarget.rigs import Rig
+from mapctl.robots import files as robot_files
+from mapctl.robots import model as robot_model
+from mapctl.robots import plausibility
+from mapctl.robots.model import Robot
+from mapctl.robots.retarget import RobotMotion, retarget_to_robot
 
 
 @dataclass(frozen=True)
@@ -39,7 +46,7 @@ class Convert(Command, options.ReadOptions):
     """.bvh, .npz, or with a skinned body .glb, .usda, .usdc, .usd or .fbx (by Blender, which must be installed): that
     of the character in IN or in --rig, where it came from such a file, else a mannequin. A .vrm is written of a VRM
     character only. A .vrma holds motion alone: of the bones of a VRM, or of any rig's canonical joints. Of a folder
-    another one, which gets the same names."""
+    another one, which gets the same names. With --robot .csv or .npz: base and joint angles of the robot."""
     to: Annotated[str | None, arg(metavar=".ENDING")] = None
     """For a folder: the ending of all results, as .glb; their own if not given, or .bvh."""
     rig: Annotated[str | None, arg(metavar="canonical|PRESET|FILE.toml|CLIP")] = None
@@ -48,6 +55,13 @@ class Convert(Command, options.ReadOptions):
     get the bones of the canonical body."""
     as_: Annotated[Literal["smpl"] | None, arg(name="as")] = None
     """`smpl`: write SMPL parameters in the layout of AMASS, as .npz: poses, trans and mocap_framerate, Z up."""
+    robot: options.MaybeFile = None
+    """Robot that moves as the person does, as MJCF or URDF: OUT is a .csv (a row a frame: position of the base, its
+    quaternion xyzw, joint angles in the model's order) or an .npz (also velocities, bodies and contacts). With such
+    a .csv as IN: the robot that it is of. A .toml of the same name beside the model names the links that are not
+    recognised."""
+    header: bool = False
+    """For a robot's .csv: a first row with the names of the columns."""
     smpl_model: options.MaybeFile = None
     """Body model for SMPL parameters in IN, an .npz of your own with v_template, shapedirs and J_regressor: bones and
     floor are those of the file's betas. Without it the bones are those of the canonical body."""
@@ -56,7 +70,7 @@ class Convert(Command, options.ReadOptions):
     legs, `keep` keeps it in metres."""
     report: options.MaybeFile = None
     """Report of the changes in retargeting, as JSON: scale, travel, hips, feet and hands that do not
-    get where they should."""
+    get where they should; of a robot also limits, speeds, self-contact, balance and feet of each second."""
     source_rig: options.MaybeRig = None
     """The rig of IN, where it is not the one that would be recognised; see `mapctl info IN`."""
     frames: Annotated[str | None, arg(metavar="A:B")] = None
@@ -97,6 +111,8 @@ class Converted:
     """Changes in retargeting to another rig."""
     notes: tuple[str, ...]
     """The same in sentences, as far as it is worth one."""
+    robot: RobotMotion | None = None
+    """The motion of the robot that it was retargeted to."""
 
 
 @dataclass(frozen=True)
@@ -111,6 +127,8 @@ class Conversion:
     source_rig: Rig | None
     body: RiggedCharacter | None = None
     """Body that gets the motion; None for the canonical joints, or for the motion's own."""
+    robot: Robot | None = None
+    """Robot of the motion that is read or written."""
 
     @staticmethod
     def of(command: Convert) -> "Conversion":
@@ -125,15 +143,29 @@ class Conversion:
         body = None if command.rig in (None, "canonical") else inputs.read_rigged(command.rig)
         if command.as_ is not None:
             body = RiggedCharacter.of(smpl.make_rest(smpl.build_skeleton(smpl.JOINTS[0])), None)[1]
-        return Conversion(command, fps, fps_in, inputs.read_rig(command.source_rig, command), body)
+        if command.robot is None and command.header:
+            raise RequestError("--header is for the .csv of a robot; name one by --robot")
+        robot = None if command.robot is None else robot_model.load(command.robot)
+        return Conversion(command, fps, fps_in, inputs.read_rig(command.source_rig, command), body, robot)
+
+    @property
+    def to_robot(self) -> bool:
+        """Whether the results are a robot's."""
+        ending = f".{(self.command.to or self.command.out.suffix).lower().removeprefix('.')}"
+        return self.robot is not None and ending in robot_files.ENDINGS
 
     def convert(self, source: Path) -> Converted:
         command, rig, notes = self.command, self.source_rig, list[str]()
         may_lack = source.suffix.lower() in formats.MAY_LACK_RATE
         fps_in = self.fps_in if may_lack or not command.source.is_dir() else None
-        motion = inputs.read_motion(
-            source, rig, fps=fps_in, body_model=command.smpl_model, markers=command.markers, quiet=command.quiet
-        )
+        if self.robot is not None and source.suffix.lower() == ".csv":
+            found = robot_files.load_csv(source, self.robot, fps_in or Fraction(PRIOR_FPS)).to_motion()
+            motion, rig = rotate_world(found, self.robot.rigmap.upright_quat_xyzw), as_rig(self.robot.rigmap)
+            rig = replace(rig, up="y")
+        else:
+            motion = inputs.read_motion(
+                source, rig, fps=fps_in, body_model=command.smpl_model, markers=command.markers, quiet=command.quiet
+            )
         edited = command.mirror or command.loop or command.plant_feet or command.in_place or command.root_motion
         if edited and command.rig is None:  # before frames are cut, since the whole clip shows the rig
             rig = as_rig(identify_rig(motion.skeleton, rig, motion=motion))
@@ -142,11 +174,11 @@ class Conversion:
             motion = motion.slice(*options.parse_range(command.frames, fps=fps, frames=frames, what="range of frames"))
         changes, cycle, lines = None, None, list[str]()
         if command.rig == "canonical":
-            motion, rig = retarget.to_canonical(motion, self.source_rig)[0], retarget.load_rig("canonical")
+            motion, rig = retarget.to_canonical(motion, rig)[0], retarget.load_rig("canonical")
         elif command.as_ is not None and (ordered := smpl.order_joints(motion)) is not None:
             motion = ordered
         elif self.body is not None:
-            found = retarget_motion(motion, self.body, self.source_rig, ground=command.ground)
+            found = retarget_motion(motion, self.body, rig, ground=command.ground)
             original = motion if motion.skeleton.matches(self.body.rigmap.rig_skeleton) else None
             motion = self.body.on_rig(found.motion, original=original, fingers=found.fingers)
             rig, changes, notes = as_rig(self.body.rigmap), found.changes, list(found.notes)
@@ -170,19 +202,26 @@ class Conversion:
             motion = editing.move_travel_to_root(motion, rig, cycle)
         ending = (command.to or command.out.suffix).lstrip(".").lower()
         if ending == "vrma" and not getattr(motion.source, "humanoid", None):  # no other rig is one that it names
-            motion = retarget.to_canonical(motion, rig or self.source_rig)[0]
-        return Converted(motion, tuple(lines), changes, tuple(notes))
+            motion = retarget.to_canonical(motion, rig)[0]
+        if not self.to_robot:
+            return Converted(motion, tuple(lines), changes, tuple(notes))
+        assert self.robot is not None
+        robot, changes = retarget_to_robot(motion, self.robot, rig)
+        return Converted(motion, tuple(lines), changes, tuple(notes), robot)
 
-    def save(self, motion: Motion, out: Path) -> None:
+    def save(self, done: Converted, out: Path) -> None:
         """Write a converted motion."""
-        (formats if self.command.as_ is None else smpl).save(motion, out)
+        if done.robot is not None:
+            robot_files.save(done.robot, out, header=self.command.header)
+        else:
+            (formats if self.command.as_ is None else smpl).save(done.motion, out)
 
     def __call__(self, source: Path, out: Path) -> tuple[int, float]:
         """Convert one file of a folder and write the result; return its frames and the seconds that it took."""
         start = perf_counter()
-        motion = self.convert(source).motion
-        self.save(motion, out)
-        return motion.num_frames, perf_counter() - start
+        done = self.convert(source)
+        self.save(done, out)
+        return done.motion.num_frames, perf_counter() - start
 
 
 def parse_fps(text: str) -> Fraction:
@@ -201,20 +240,33 @@ def _describe_feet(motion: Motion, rig: Rig | None) -> str:
     return f"planted toes {100 * feet.contact_speed(toes):.1f} cm/s, skate {100 * feet.skate(toes):.1f} cm/s"
 
 
+def _describe_robot(seconds: list[plausibility.Second]) -> str:
+    worst = plausibility.find_worst(seconds)
+    limits = "held" if worst.limit_excess_deg == 0 else f"exceeded by {worst.limit_excess_deg:.1f} deg"
+    speed = f", {worst.speed_share:.0%} of its largest" if worst.speed_share else ""
+    return (
+        f"worst frames: limits {limits}, joints {worst.speed_rad_s:.1f} rad/s{speed}, standing feet slide"
+        f" {worst.slide_cm_s:.1f} cm/s, soles {worst.sole_low_cm:.1f} to {worst.sole_high_cm:.1f} cm, links"
+        f" {worst.self_contact_cm:.1f} cm in each other, centre of mass {worst.balance_cm:.0f} cm off its support"
+    )
+
+
 def run(command: Convert) -> int:
-    if command.rig is None and (command.report is not None or command.ground != "fit"):
-        option = "--report" if command.report is not None else "--ground"
-        raise RequestError(f"{option} is about motion on another rig; name one by --rig")
+    if command.rig is None and command.ground != "fit":
+        raise RequestError("--ground is about motion on another rig; name one by --rig")
+    if command.rig is None and command.robot is None and command.report is not None:
+        raise RequestError("--report is about motion on another rig or robot; name one by --rig or --robot")
     if command.source.is_dir():
         if command.report is not None:
             raise RequestError("--report is on one file; a folder has none")
         ending = None if command.to is None else f".{command.to.lower().removeprefix('.')}"
-        if ending is not None:
+        conversion = Conversion.of(command)
+        if ending is not None and not conversion.to_robot:
             formats.check_ending(f"a{ending}")
         return folders.run_folder(
             command.source,
             command.out,
-            Conversion.of(command),
+            conversion,
             label="converting",
             done="converted",
             again=command.again,
@@ -225,17 +277,23 @@ def run(command: Convert) -> int:
     for name, idle in (("to", command.to is None), ("again", not command.again), ("jobs", command.jobs == 1)):
         if not idle:
             raise RequestError(f"--{name} is for folders; {command.source} is a file")
-    formats.check_ending(command.out)
-    outputs.check_files([command.out, *options.collect_paths(command.report)])
     conversion = Conversion.of(command)
+    if not conversion.to_robot:
+        formats.check_ending(command.out)
+    outputs.check_files([command.out, *options.collect_paths(command.report)])
     done = conversion.convert(command.source)
-    conversion.save(done.motion, command.out)
+    conversion.save(done, command.out)
+    seconds = [] if done.robot is None else plausibility.assess(done.robot)
     if command.report is not None and done.changes is not None:
         request = options.describe_request("convert", command)
         changes = asdict(done.changes) | {"notes": list(done.notes)}
-        report.write_report({"mapctl": __version__, "request": request, "changes": changes}, command.report)
+        found = {"mapctl": __version__, "request": request, "changes": changes}
+        if seconds:
+            found["seconds"] = [asdict(second) for second in seconds]
+        report.write_report(found, command.report)
     if not command.quiet:
         rate = f"{float(done.motion.fps):.6g} frames a second"
         size = f"{done.motion.num_frames} frames, {done.motion.num_joints} joints"
-        print("\n".join([f"{command.out}: {size}, {rate}", *done.lines]))
+        lines = [f"{command.out}: {size}, {rate}", *done.lines]
+        print("\n".join([*lines, _describe_robot(seconds)] if seconds else lines))
     return 0

@@ -1,0 +1,298 @@
+"""The kinematic model of a robot: links, hinges and their limits, read from MJCF or URDF by MuJoCo (Todorov et al. 2012),
+and which of its links is which part of a person.
+
+All link frames are aligned with the robot's world, Z up and X ahead, where its joint angles are zero: a hinge turns its
+link by a rotation vector along its axis, and the robot is a skeleton like any other.
+"""
+
+import xml.etree.ElementTree as ElementTree
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from os import PathLike
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+from annotated_types import Gt
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mapctl import kinematics, rotations
+from mapctl.errors import FileFormatError, RequestError
+from mapctl.formats import toml
+from mapctl.formats.text import one_line
+from mapctl.joint_names import Part, Role, Side, classify_joint
+from mapctl.retarget import RigMap, identify_rig
+from mapctl.retarget.character import RiggedCharacter, Stance
+from mapctl.retarget.joint_matching import REQUIRED
+from mapctl.retarget.rigs import Rig
+from mapctl.skeleton import CANONICAL, Skeleton
+
+_LIMB_PARTS = {
+    Part.HIPS: "UpperLeg",
+    Part.UPPER_LEG: "UpperLeg",
+    Part.LOWER_LEG: "LowerLeg",
+    Part.FOOT: "Foot",
+    Part.SHOULDER: "UpperArm",
+    Part.UPPER_ARM: "UpperArm",
+    Part.LOWER_ARM: "LowerArm",
+    Part.HAND: "Hand",
+}
+"""Canonical joints of a side by what the names of links say: hips of a side are thighs, and shoulders upper arms."""
+_BALLS = ("UpperLeg", "UpperArm")  # joints whose hinges about meet in a point
+
+
+@dataclass(frozen=True)
+class _Stated:
+    """A robot's TOML."""
+
+    __pydantic_config__ = toml.STRICT
+
+    links: Mapping[str, str] = field(default_factory=dict)
+    """Link by canonical joint, where names do not show it."""
+    speed: Annotated[float, Gt(0)] | None = None
+    """Largest speed of all joints, rad/s."""
+    soles: Mapping[str, Sequence[Sequence[float]]] = field(default_factory=dict)
+    """Corners of the soles by foot link, each x, y and z in the link's frame in the model, metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """A robot with a floating base and hinges."""
+
+    skeleton: Skeleton
+    """Links, the first of which is the base. The End Site of a foot is the tip of its sole."""
+    joints: tuple[str, ...]
+    """Names of the joints, in the model's order."""
+    hinges: tuple[int, ...]
+    """The link that each joint turns."""
+    axes: Float[Tensor, "joints 3"]
+    """Unit vector along each joint's axis."""
+    low: Float[Tensor, " joints"]
+    """Smallest angles, radians."""
+    high: Float[Tensor, " joints"]
+    """Largest angles, radians."""
+    speed: Float[Tensor, " joints"]
+    """Largest speeds, rad/s; infinite where none are stated."""
+    zero: Float[Tensor, "links 3 3"]
+    """Orientation of each link's frame in the model where all angles are zero."""
+    soles: tuple[Float[Tensor, "corners 3"], Float[Tensor, "corners 3"]]
+    """Corners of the left and the right sole about the origins of their links, metres."""
+    rigmap: RigMap
+    """The links as a rig of a person."""
+    model: Any
+    """MuJoCo's model."""
+
+    @cached_property
+    def character(self) -> RiggedCharacter:
+        """The robot as a character whose tips of the soles are its toes."""
+        flat = torch.zeros(2, dtype=torch.float64)
+        return RiggedCharacter(self.rigmap, Stance(flat, flat, torch.zeros(2, 2, dtype=torch.float64)))
+
+    @cached_property
+    def above(self) -> Bool[Tensor, "links joints"]:
+        """Whether each joint moves each link."""
+        found = torch.zeros(self.skeleton.num_joints, len(self.joints), dtype=torch.bool)
+        for link, parent in enumerate(self.skeleton.parents):
+            if parent >= 0:
+                found[link] = found[parent]
+            if link in self.hinges:
+                found[link, self.hinges.index(link)] = True
+        return found
+
+    def find_link(self, joint: str) -> int | None:
+        """Find the link that is a canonical joint, None if there is none."""
+        return self.rigmap.joints.get(joint)
+
+    def rotate_links(
+        self, base: Float[Tensor, "frames 3 3"], angles: Float[Tensor, "frames joints"]
+    ) -> Float[Tensor, "frames links 3 3"]:
+        """Compute each link's rotation in its parent, at orientations of the base and angles, radians."""
+        vectors = angles.new_zeros(len(angles), self.skeleton.num_joints, 3)
+        vectors[:, list(self.hinges)] = angles[..., None] * self.axes
+        return torch.cat([base[:, None], rotations.rotation_vector_to_matrix(vectors[:, 1:])], dim=1)
+
+    def chain_links(
+        self, base: Float[Tensor, "frames 3 3"], angles: Float[Tensor, "frames joints"]
+    ) -> tuple[Float[Tensor, "frames links 3"], Float[Tensor, "frames links 3 3"]]:
+        """Compute positions of all links about the base, metres, and their orientations."""
+        local = self.rotate_links(base, angles)
+        return kinematics.chain_matrices(self.skeleton.offsets, self.skeleton.parents, local)
+
+
+def load(path: str | PathLike[str]) -> Robot:
+    """Load a robot. A .toml of the same name beside it states what it does not show: `links`, `speed` and `soles`.
+    FileFormatError for a file that is no robot with two legs and arms, RequestError without MuJoCo."""
+    path = Path(path)
+    model = _compile(path)
+    beside, keys = path.with_suffix(".toml"), "links, speed, soles"
+    stated = _Stated()
+    if beside.exists():
+        stated = toml.read(beside, _Stated, what="robot's table", unknown=lambda _: f"allowed: {keys}")
+    return _Tree(path, model).build(stated)
+
+
+def _compile(path: Path) -> Any:
+    """Compile a model, without its meshes where their files are not there."""
+    try:
+        import mujoco
+    except ImportError:
+        raise RequestError("robots need MuJoCo: pip install 'mapctl[robot]'") from None
+    if not path.is_file():
+        raise RequestError(f"{path}: no such file")
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        spec.compiler.fusestatic = False
+        try:
+            return spec.compile()
+        except ValueError:
+            for geom in [geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_MESH]:
+                spec.delete(geom)
+            for mesh in list(spec.meshes):
+                spec.delete(mesh)
+            return spec.compile()
+    except Exception as error:  # MuJoCo raises whatever its parsers do
+        raise FileFormatError(path, f"is no model that MuJoCo can read: {one_line(error)}") from error
+
+
+class _Tree:
+    """Links of a model where all angles are zero. Of a body with several hinges each but the last has a link of its own;
+    a link's origin is on its hinge."""
+
+    def __init__(self, path: Path, model: Any):
+        import mujoco
+
+        self.path, self.model, self.data = path, model, mujoco.MjData(model)
+        free = [int(model.jnt_qposadr[j]) for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE]
+        self.data.qpos[:] = 0
+        self.data.qpos[[first + 3 for first in free]] = 1
+        mujoco.mj_kinematics(model, self.data)
+        self.names: list[str] = []
+        self.parents: list[int] = []
+        self.origins: list[np.ndarray] = []
+        self.zero: list[np.ndarray] = []
+        self.hinges: list[int] = []
+        self.turning: list[int] = []  # number of the joint in the model, by hinge
+        self.link_of: dict[int, int] = {}  # by body
+        for body in range(1, model.nbody):
+            above = self.link_of.get(int(model.body_parentid[body]), -1)
+            if above < 0 and self.link_of:
+                continue  # another tree: an object to be carried
+            first = int(model.body_jntadr[body])
+            own = [first + k for k in range(int(model.body_jntnum[body])) if first + k < model.njnt]
+            own = [j for j in own if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_FREE]
+            if any(model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE for j in own) or (own and above < 0):
+                raise FileFormatError(path, f"{model.body(body).name}: only hinges are known below a free base")
+            for joint in own[:-1]:
+                above = self._add(model.joint(joint).name, above, body, joint)
+            self.link_of[body] = self._add(model.body(body).name or f"body{body}", above, body, *own[-1:])
+
+    def _add(self, name: str, above: int, body: int, joint: int | None = None) -> int:
+        self.names.append(name)
+        self.parents.append(above)
+        self.origins.append(np.array(self.data.xpos[body] if joint is None else self.data.xanchor[joint]))
+        self.zero.append(np.array(self.data.xmat[body]).reshape(3, 3))
+        if joint is not None:
+            self.hinges.append(len(self.names) - 1)
+            self.turning.append(joint)
+        return len(self.names) - 1
+
+    def build(self, stated: _Stated) -> Robot:
+        """Build the robot; FileFormatError where a part of a person is not among its links."""
+        links = self._match_links() | dict(stated.links)
+        for joint in REQUIRED:
+            if links.get(joint) not in self.names:
+                beside = self.path.with_suffix(".toml").name
+                raise FileFormatError(self.path, f"no link is known to be {joint}; name it under [links] in {beside}")
+        at, model = np.stack(self.origins), self.model
+        offsets = np.concatenate([np.zeros((1, 3)), at[1:] - at[self.parents[1:]]])
+        feet = [links[f"{side}Foot"] for side in ("left", "right")]
+        soles = [self._find_sole(foot, stated) for foot in feet]
+        tips = [np.array([sole[:, 0].max(), sole[:, 1].mean(), sole[:, 2].min()]) for sole in soles]
+        ends = {foot: (float(tip[0]), float(tip[1]), float(tip[2])) for foot, tip in zip(feet, tips, strict=True)}
+        skeleton = Skeleton(tuple(self.names), tuple(self.parents), torch.from_numpy(offsets), ends)
+        joints = [model.joint(joint).name for joint in self.turning]
+        limited = model.jnt_limited[self.turning].astype(bool)[:, None]
+        ranges = torch.from_numpy(np.where(limited, model.jnt_range[self.turning], [-np.pi, np.pi]))
+        speeds = {} if stated.speed is not None else _read_speeds(self.path)
+        speed = [speeds.get(joint, stated.speed or np.inf) for joint in joints]
+        rig = Rig(self.path.stem, links, rest="straighten", up="z", facing="x")
+        return Robot(
+            skeleton,
+            tuple(joints),
+            tuple(self.hinges),
+            torch.from_numpy(self.data.xaxis[self.turning]),
+            *ranges.unbind(dim=1),
+            torch.tensor(speed, dtype=torch.float64),
+            torch.from_numpy(np.stack(self.zero)),
+            (torch.from_numpy(soles[0]), torch.from_numpy(soles[1])),
+            identify_rig(skeleton, rig),
+            model,
+        )
+
+    def _find_sole(self, foot: str, stated: _Stated) -> Float[np.ndarray, "corners 3"]:
+        """Find the corners of a sole: of the box around all shapes of the foot and of what is fixed to it."""
+        link = self.names.index(foot)
+        if foot in stated.soles:
+            return np.array(stated.soles[foot], dtype=np.float64).reshape(-1, 3) @ self.zero[link].T
+        model, data, points = self.model, self.data, []
+        bodies = {body for body, own in self.link_of.items() if self._find_moving(own) == link}
+        for geom in (geom for geom in range(model.ngeom) if int(model.geom_bodyid[geom]) in bodies):
+            signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+            box = model.geom_aabb[geom, :3] + signs * model.geom_aabb[geom, 3:]
+            points.append(data.geom_xpos[geom] + box @ data.geom_xmat[geom].reshape(3, 3).T)
+        if not points:
+            beside = self.path.with_suffix(".toml").name
+            raise FileFormatError(self.path, f"{foot} has no shape; give the corners of its sole under [soles] in {beside}")
+        low, high = (edge(np.concatenate(points), axis=0) - self.origins[link] for edge in (np.min, np.max))
+        return np.array([(x, y, low[2]) for x in (low[0], high[0]) for y in (low[1], high[1])])
+
+    def _find_moving(self, link: int) -> int:
+        """Find the link that carries a link: itself if it turns."""
+        while link not in self.hinges and self.parents[link] >= 0:
+            link = self.parents[link]
+        return link
+
+    def _match_links(self) -> dict[str, str]:
+        """Match links with canonical joints by the words of their names: of those that turn, the last of a part; of
+        hips and shoulders that which is nearest to the point where their axes meet."""
+        roles = [classify_joint(name) for name in self.names]
+        every = range(len(self.names))
+        trunk = [link for link in every if roles[link] == Role(Side.MIDDLE, Part.TORSO)]
+        trunk = [link for link in trunk if link in self.hinges] or trunk
+        found = {"hips": 0} | ({"spine": trunk[0], "chest": trunk[-1]} if trunk else {})
+        if len(trunk) == 1:
+            del found["chest"]
+        heads = [link for link in every if roles[link] == Role(Side.MIDDLE, Part.HEAD)]
+        if heads:
+            found["head"] = max(heads, key=lambda link: self.origins[link][2])
+        groups: dict[str, list[int]] = defaultdict(list)
+        for link in self.hinges:
+            part = _LIMB_PARTS.get(roles[link].part)
+            if part is not None and roles[link].side is not Side.MIDDLE:
+                groups[roles[link].side.value + part].append(link)
+        for joint, links in groups.items():
+            balls = joint.endswith(_BALLS) and len(links) > 1
+            found[joint] = min(links, key=self._measure_from_axes(links)) if balls else links[-1]
+        return {joint: self.names[link] for joint, link in found.items()}
+
+    def _measure_from_axes(self, links: list[int]) -> Any:
+        """Return the distance of a link from the point that is nearest to the axes of some, by least squares."""
+        axes = self.data.xaxis[[self.turning[self.hinges.index(link)] for link in links]]
+        across = np.eye(3) - axes[:, :, None] * axes[:, None]
+        at = np.stack([self.origins[link] for link in links])
+        centre = np.linalg.lstsq(across.sum(axis=0), (across @ at[..., None]).sum(axis=0)[:, 0], rcond=None)[0]
+        return lambda link: float(np.linalg.norm(self.origins[link] - centre))
+
+
+def _read_speeds(path: Path) -> dict[str, float]:
+    """Read the largest speeds of a URDF's joints, rad/s, which MuJoCo leaves out."""
+    found = {}
+    for joint in ElementTree.parse(path).iter("joint"):
+        limit = joint.find("limit")
+        if limit is not None and float(limit.get("velocity", 0)) > 0:
+            found[joint.get("name", "")] = float(limit.get("velocity", 0))
+    return found

@@ -1,0 +1,359 @@
+"""Retarget the motion of a person to a robot: base and joint angles of all frames of a window as one MAP problem.
+
+The motion is first carried to the robot's bones as if its joints were free: in scale, with planted feet, and hands that
+keep their relations (`mapctl.retarget.carry`). What is found there is observed, each part with an error of its own:
+base and chest, hands and feet, loosely elbows and knees. The tip of a sole that stands is observed almost without
+error, at one point of the floor, and so is the foot's orientation while its heel is down. Squared third differences are
+the prior of smooth motion.
+
+Gauss's and Newton's method on the banded system of all frames, damped (Levenberg 1944; Marquardt 1963), finds the
+angles. Limits of joints hold in each step: angles at a limit are fixed where the gradient leads beyond (projected
+Newton, Bertsekas 1982). Speeds beyond a joint's are penalised, and what is left of them is cut in the end.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.linalg import solveh_banded
+from torch import Tensor
+
+from mapctl import rotations
+from mapctl.motion import Motion
+from mapctl.retarget.carry import Changes, find_ground, retarget_motion
+from mapctl.retarget.character import FEET, TOES
+from mapctl.retarget.hands import Spans
+from mapctl.retarget.rigs import Rig
+from mapctl.robots.model import Robot
+from mapctl.skeleton import CANONICAL
+
+_POSITION_ERRORS = {"hips": 0.03, "LowerLeg": 0.05, "Foot": 0.01, "LowerArm": 0.05, "Hand": 0.02}
+"""Errors of observed positions, metres (standard deviation), by joint on either side."""
+_ORIENTATION_ERRORS = {"hips": 0.1, "chest": 0.15, "head": 0.2, "Foot": 0.15, "Hand": 0.4}
+"""Errors of observed orientations, radians."""
+_STANDING_ERROR, _FLAT_ERROR = 0.0003, 0.003  # metres of the tip of a sole that stands, radians of a foot that is flat
+_SOLE_DOWN, _LEVEL = 0.5, 0.9  # least cosine between the vertical and a foot that stands, and one that is flat
+_HEEL_METRES = 0.015  # over its height on a flat foot, within which an ankle's heel is down
+_ANGLE_ERROR = 1.0  # radians by which joints are away from zero, if nothing shows it
+_JERKS = (40.0, 1000.0, 2000.0)  # of the base's position, m/s^3, and orientation, and of joints, rad/s^3
+_SPEED_ERROR, _SPEED_SHARE = 1e-3, 0.98  # radians a frame beyond that share of a joint's largest speed
+_ITERATIONS, _LONGEST_STEP, _CONVERGED = 30, 0.5, 1e-4  # of the search; radians or metres; share of the cost
+_WINDOW, _OVERLAP, _HELD = 600, 30, 10  # frames that are solved at once; solved again; and of these the first, held
+
+
+@dataclass(frozen=True, eq=False)
+class RobotMotion:
+    """Base and joint angles of a robot over time."""
+
+    robot: Robot
+    fps: Fraction
+    position: Float[Tensor, "frames 3"]
+    """Position of the base, metres, Z up."""
+    orientation: Float[Tensor, "frames 3 3"]
+    """Orientation of the base."""
+    angles: Float[Tensor, "frames joints"]
+    """Joint angles, radians."""
+    contacts: Bool[Tensor, "frames 2"]
+    """Whether the left and the right foot stand."""
+
+    def slice(self, start: int, stop: int) -> RobotMotion:
+        """Return frames start to stop."""
+        tracks = {name: getattr(self, name)[start:stop] for name in _TRACKS}
+        return replace(self, **tracks)
+
+    def join(self, after: RobotMotion) -> RobotMotion:
+        """Return this motion with another one after it."""
+        return replace(self, **{name: torch.cat([getattr(self, name), getattr(after, name)]) for name in _TRACKS})
+
+    def to_motion(self) -> Motion:
+        """Return the links' motion, whose rig is that of the robot."""
+        local = self.robot.rotate_links(self.orientation, self.angles)
+        quats = rotations.make_sign_continuous(rotations.from_matrix(local))
+        return Motion(self.robot.skeleton, self.fps, self.position, quats)
+
+    def chain_links(self) -> tuple[Float[Tensor, "frames links 3"], Float[Tensor, "frames links 3 3"]]:
+        """Compute positions of all links in the world, metres, and their orientations."""
+        at, world = self.robot.chain_links(self.orientation, self.angles)
+        return at + self.position[:, None], world
+
+    def find_soles(self) -> tuple[Float[Tensor, "frames corners 3"], Float[Tensor, "frames corners 3"]]:
+        """Find the corners of the left and the right sole, metres; the second half are those ahead."""
+        at, world = self.chain_links()
+        links = [self.robot.find_link(f"{side}Foot") for side in ("left", "right")]
+        left, right = (
+            at[:, link, None] + (world[:, link, None] @ sole[..., None])[..., 0]
+            for link, sole in zip(links, self.robot.soles, strict=True)
+        )
+        return left, right
+
+
+_TRACKS = ("position", "orientation", "angles", "contacts")
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Points and orientations that links are to have, with weights: inverse squared errors."""
+
+    links: list[int]
+    points: Float[Tensor, "observed 3"]
+    """The point of each link, about its origin, metres."""
+    positions: Float[Tensor, "frames observed 3"]
+    position_weights: Float[Tensor, "frames observed"]
+    orientations: Float[Tensor, "frames observed 3 3"]
+    orientation_weights: Float[Tensor, "frames observed"]
+    standing: Bool[Tensor, "frames 2"]
+
+    def slice(self, start: int, stop: int) -> Observations:
+        """Return frames start to stop."""
+        names = ("positions", "position_weights", "orientations", "orientation_weights", "standing")
+        return replace(self, **{name: getattr(self, name)[start:stop] for name in names})
+
+
+def retarget_to_robot(motion: Motion, robot: Robot, rig: Rig | None = None) -> tuple[RobotMotion, Changes]:
+    """Find the angles with which a robot moves as a person does, at the motion's frame rate; also return how the motion
+    changed for the robot's bones. `rig` is the motion's, where it is not the one that would be recognised."""
+    carried = retarget_motion(motion, robot.character, rig)
+    seen = observe(carried.motion, robot)
+    done, stop = None, 0
+    while stop < motion.num_frames:
+        start, held = max(0, stop - _OVERLAP), min(_HELD, stop)
+        stop = min(motion.num_frames, start + _WINDOW)
+        part = _start(robot, seen.slice(start, stop), motion.fps)
+        if done is not None:
+            part = done.slice(start, done.angles.shape[0]).join(part.slice(_OVERLAP, stop - start))
+        part = _minimise(part, seen.slice(start, stop), held)
+        done = part if done is None else done.slice(0, start).join(part)
+    assert done is not None
+    return _cut_speeds(done), carried.changes
+
+
+def observe(own: Motion, robot: Robot) -> Observations:
+    """Observe links in a motion on the robot's bones, canonical joints, Y up."""
+    found = list(_observe_joints(own, robot))
+    links, points, *tracks, standing = zip(*found, strict=True)
+    positions, position_weights, orientations, orientation_weights = (torch.stack(track, dim=1) for track in tracks)
+    feet = torch.stack([stands for stands in standing if stands is not None], dim=1)
+    return Observations(
+        list(links), torch.stack(points), positions, position_weights, orientations, orientation_weights, feet
+    )
+
+
+def _observe_joints(own: Motion, robot: Robot) -> Iterator[tuple[int, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None]]:
+    """Yield link, point, positions and weights, orientations and weights of each observed point; with the tip of a sole
+    the frames in which it stands."""
+    rigmap, frames = robot.rigmap, own.num_frames
+    upright = rigmap.upright_quat_xyzw
+    down = torch.tensor([0.0, 0.0, 0.0, 1.0]).double() if upright is None else rotations.inverse(upright)
+    turned, at = own.joint_rotations(), rotations.rotate(down.expand(frames, CANONICAL.num_joints, 4), own.joint_positions())
+    spans, raised = find_ground(own, robot.character.stance)
+    origin, nothing = torch.zeros(3, dtype=torch.float64), torch.zeros(frames, dtype=torch.float64)
+    for joint, name in enumerate(CANONICAL.names):
+        part = name.removeprefix("left").removeprefix("right")
+        errors = [table.get(part, math.inf) for table in (_POSITION_ERRORS, _ORIENTATION_ERRORS)]
+        link = robot.find_link(name)
+        if link is None or errors == [math.inf, math.inf] or (name == "head" and not _turns(robot, "chest", link)):
+            continue
+        weight, turn_weight = (torch.full((frames,), error**-2, dtype=torch.float64) for error in errors)
+        tpose = rotations.multiply(down, rigmap.tpose_quat_xyzw[joint])
+
+        def orient(quats: Tensor, joint: int = joint) -> Tensor:
+            placed = rotations.multiply(quats, rigmap.tpose_quat_xyzw[joint].expand(frames, 4))
+            return rotations.to_matrix(rotations.multiply(down.expand(frames, 4), placed))
+
+        orientation = orient(turned[:, joint])
+        if part == "Foot":
+            side = FEET.index(joint)
+            foot = _Foot.of(own, robot, side, spans[side])
+            orientation = torch.where(foot.flat[:, None, None], orient(rotations.about_y(foot.heading)), orientation)
+            turn_weight = torch.where(foot.flat, _FLAT_ERROR**-2, turn_weight)
+            tip = at[:, TOES[side]].clone()
+            for start, stop in foot.spans:
+                tip[start:stop] = tip[start:stop].mean(dim=0)
+                tip[start:stop, 2] = raised[start, side]
+            tip_weight = torch.where(foot.stands, _STANDING_ERROR**-2, weight)
+            end = torch.tensor(robot.skeleton.end_offsets[robot.skeleton.names[link]], dtype=torch.float64)
+            yield link, end, tip, tip_weight, orientation, turn_weight, foot.stands
+            weight, turn_weight = torch.where(foot.stands, 0.0, weight), nothing
+        yield link, origin, at[:, joint], weight, orientation, turn_weight, None
+
+
+def _turns(robot: Robot, below: str, link: int) -> bool:
+    """Return whether a joint turns a link that does not turn the one that is a canonical joint."""
+    other = robot.find_link(below)
+    return bool((robot.above[link] & ~robot.above[0 if other is None else other]).any())
+
+
+@dataclass(frozen=True, eq=False)
+class _Foot:
+    """How one foot stands."""
+
+    spans: Spans
+    """Where its sole is down."""
+    stands: Bool[Tensor, " frames"]
+    flat: Bool[Tensor, " frames"]
+    """Whether it stands with its heel down."""
+    heading: Float[Tensor, " frames"]
+    """Radians; constant where it is flat."""
+
+    @staticmethod
+    def of(own: Motion, robot: Robot, side: int, touching: Spans) -> _Foot:
+        turns, positions = own.joint_rotations()[:, FEET[side]], own.joint_positions()
+        upward = rotations.rotate(turns, torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))[:, 1]
+        spans = [(start, stop) for start, stop in touching if float(upward[start:stop].mean()) > _SOLE_DOWN]
+        stands = torch.zeros(own.num_frames, dtype=torch.bool)
+        heading = rotations.unwrap_angle(rotations.split_heading(turns)[0])
+        height = positions[:, FEET[side], 1] - positions[:, TOES[side], 1] + robot.rigmap.skeleton.offsets[TOES[side], 1]
+        flat = (upward > _LEVEL) & (height < _HEEL_METRES)
+        for start, stop in spans:
+            stands[start:stop] = True
+            lies = flat[start:stop]
+            if lies.any():
+                heading[start:stop] = heading[start:stop][lies].mean()
+        return _Foot(spans, stands, flat & stands, heading)
+
+
+def _start(robot: Robot, seen: Observations, fps: Fraction) -> RobotMotion:
+    """Return the start of a search: the base as observed, all joints at zero."""
+    angles = torch.zeros(len(seen.positions), len(robot.joints), dtype=torch.float64).clamp(robot.low, robot.high)
+    return RobotMotion(robot, fps, seen.positions[:, 0].clone(), seen.orientations[:, 0].clone(), angles, seen.standing)
+
+
+def _minimise(now: RobotMotion, seen: Observations, held: int) -> RobotMotion:
+    """Minimise the cost over all frames but the first, which are held."""
+    damping, system = 1e-3, _System.of(now, seen)
+    for _ in range(_ITERATIONS):
+        while True:
+            tried = system.step(now, damping, held)
+            found = _System.of(tried, seen)
+            if found.cost <= system.cost or damping > 1e3:
+                break
+            damping *= 10
+        gained = system.cost - found.cost
+        if gained < 0:
+            break
+        now, system, damping = tried, found, max(damping / 10, 1e-6)
+        if gained < _CONVERGED * system.cost:
+            break
+    return now
+
+
+_THIRD = (-1.0, 3.0, -3.0, 1.0)  # coefficients of the third difference
+
+
+@dataclass(frozen=True, eq=False)
+class _System:
+    """The cost at a motion, and the linear system of its next step. Unknowns of a frame are the base's position,
+    rotation about the world's axes, and angles."""
+
+    cost: float
+    hessian: Float[Tensor, "frames unknowns unknowns"]
+    """Of each frame's own terms."""
+    coupling: Float[Tensor, "steps joints"]
+    """Weight of each joint's change from frame to frame."""
+    gradient: Float[Tensor, "frames unknowns"]
+    """Downhill."""
+    jerk: Float[Tensor, " unknowns"]
+    """Weight of squared third differences."""
+
+    @staticmethod
+    def of(now: RobotMotion, seen: Observations) -> _System:
+        """Linearise all terms at a motion."""
+        robot, fps = now.robot, float(now.fps)
+        at, world = robot.chain_links(now.orientation, now.angles)
+        points = at[:, seen.links] + (world[:, seen.links] @ seen.points[..., None])[..., 0]
+        away = seen.orientations @ world[:, seen.links].mT
+        turned = rotations.to_rotation_vector(rotations.from_matrix(away))
+        residual = torch.cat([seen.positions - points - now.position[:, None], turned], dim=1)
+        weights = torch.cat([seen.position_weights, seen.orientation_weights], dim=1)[..., None].expand_as(residual)
+        jacobian = _differentiate(robot, seen.links, points, at, world)
+        weighted = jacobian * weights.flatten(1)[..., None]
+        hessian, gradient = weighted.mT @ jacobian, (weighted.mT @ residual.flatten(1)[..., None])[..., 0]
+        cost = (weights * residual.square()).sum() + (now.angles / _ANGLE_ERROR).square().sum()
+        joints = range(6, gradient.shape[1])
+        hessian[:, joints, joints] += _ANGLE_ERROR**-2
+        gradient[:, 6:] -= now.angles / _ANGLE_ERROR**2
+        jerk = torch.tensor([_JERKS[0]] * 3 + [_JERKS[1]] * 3 + [_JERKS[2]] * len(joints), dtype=torch.float64)
+        jerk = (fps**3 / jerk) ** 2
+        spin = rotations.to_rotation_vector(rotations.from_matrix(now.orientation[1:] @ now.orientation[:-1].mT))
+        third = [now.position.diff(n=3, dim=0), spin.diff(n=2, dim=0), now.angles.diff(n=3, dim=0)]
+        if len(third[0]):
+            rough = jerk * torch.cat(third, dim=1)
+            cost = cost + (rough.square() / jerk).sum()
+            for lag, sign in enumerate(_THIRD):
+                gradient[lag : lag + len(rough)] -= sign * rough
+        steps, most = now.angles.diff(dim=0), _SPEED_SHARE * robot.speed / fps
+        beyond = steps - torch.minimum(torch.maximum(steps, -most), most)
+        coupling = (beyond != 0) / _SPEED_ERROR**2
+        cost = cost + (beyond / _SPEED_ERROR).square().sum()
+        gradient[1:, 6:] -= coupling * beyond
+        gradient[:-1, 6:] += coupling * beyond
+        return _System(float(cost), hessian, coupling.double(), gradient, jerk)
+
+    def step(self, now: RobotMotion, damping: float, held: int) -> RobotMotion:
+        """Solve for the next motion."""
+        robot, (frames, size) = now.robot, self.gradient.shape
+        free = torch.ones(frames, size, dtype=torch.bool)
+        leads = self.gradient[:, 6:]
+        free[:, 6:] = ((now.angles > robot.low) | (leads > 0)) & ((now.angles < robot.high) | (leads < 0))
+        free[:held] = False
+        own = self.hessian * free[:, :, None] * free[:, None]
+        diagonal = own.diagonal(dim1=1, dim2=2)
+        own = own + torch.diag_embed(torch.where(free, damping * diagonal + 1e-9, 1.0))
+        bands = np.zeros((3 * size + 1, frames * size))  # the upper ones, as scipy's solveh_banded has them
+        for offset in range(size):
+            bands[-1 - offset].reshape(frames, size)[:, offset:] = own.diagonal(offset=offset, dim1=1, dim2=2)
+        for lag in range(4):  # of third differences
+            row = np.zeros((frames, size))
+            for later in range(lag, 4):
+                row[later : frames - 3 + later] += _THIRD[later - lag] * _THIRD[later] * self.jerk.numpy()
+            if lag == 0:
+                row[1:, 6:] += self.coupling.numpy()
+                row[:-1, 6:] += self.coupling.numpy()
+            elif lag == 1:
+                row[1:, 6:] -= self.coupling.numpy()
+            row[lag:] *= (free[lag:] & free[: frames - lag]).numpy()
+            bands[-1 - lag * size] += row.ravel()
+        change = torch.from_numpy(solveh_banded(bands, (self.gradient * free).numpy().ravel()).reshape(frames, size))
+        change = change / (change.abs().amax(dim=1, keepdim=True) / _LONGEST_STEP).clamp_min(1.0)
+        return replace(
+            now,
+            position=now.position + change[:, :3],
+            orientation=rotations.rotation_vector_to_matrix(change[:, 3:6]) @ now.orientation,
+            angles=(now.angles + change[:, 6:]).clamp(robot.low, robot.high),
+        )
+
+
+def _differentiate(
+    robot: Robot,
+    links: list[int],
+    points: Float[Tensor, "frames observed 3"],
+    at: Float[Tensor, "frames links 3"],
+    world: Float[Tensor, "frames links 3 3"],
+) -> Float[Tensor, "frames rows unknowns"]:
+    """Differentiate points on links, about the base, and the links' orientations by the unknowns."""
+    hinges = list(robot.hinges)
+    moved = robot.above[links][..., None].double()
+    axes = (world[:, hinges] @ robot.axes[..., None])[:, None, ..., 0] * moved
+    one = torch.eye(3, dtype=torch.float64).expand(*points.shape, 3)
+    levers = torch.linalg.cross(one, points[..., None, :].expand_as(one))
+    swung = torch.linalg.cross(axes, (points[:, :, None] - at[:, None, hinges]))
+    by_position = torch.cat([one, levers, swung], dim=2)
+    by_rotation = torch.cat([torch.zeros_like(one), one, axes], dim=2)
+    return torch.cat([by_position, by_rotation], dim=1).mT.flatten(1, 2)
+
+
+def _cut_speeds(found: RobotMotion) -> RobotMotion:
+    """Cut what is left of speeds beyond the joints'."""
+    most = found.robot.speed / float(found.fps)
+    if not (found.angles.diff(dim=0).abs() > most).any():
+        return found
+    angles = [found.angles[0]]
+    for wanted in found.angles[1:]:
+        angles.append(torch.minimum(torch.maximum(wanted, angles[-1] - most), angles[-1] + most))
+    return replace(found, angles=torch.stack(angles))
