@@ -13,9 +13,8 @@ from mapctl.commands.shared import folders, inputs, options, outputs
 from mapctl.commands.shared.command import Command
 from mapctl.editing.rigged_motion import RiggedMotion
 from mapctl.errors import RequestError
-from mapctl.formats import smpl
 from mapctl.features import PRIOR_FPS
-from mapctl.kinematics.moving import rotate_world
+from mapctl.formats import smpl
 from mapctl.metrics import feet
 from mapctl.motion import Motion
 from mapctl.retarget import as_rig, identify_rig
@@ -159,9 +158,8 @@ class Conversion:
         may_lack = source.suffix.lower() in formats.MAY_LACK_RATE
         fps_in = self.fps_in if may_lack or not command.source.is_dir() else None
         if self.robot is not None and source.suffix.lower() == ".csv":
-            found = robot_files.load_csv(source, self.robot, fps_in or Fraction(PRIOR_FPS)).to_motion()
-            motion, rig = rotate_world(found, self.robot.rigmap.upright_quat_xyzw), as_rig(self.robot.rigmap)
-            rig = replace(rig, up="y")
+            motion = robot_files.load_csv(source, self.robot, fps_in or Fraction(PRIOR_FPS)).to_motion()
+            rig = replace(as_rig(self.robot.rigmap), up="y")
         else:
             motion = inputs.read_motion(
                 source, rig, fps=fps_in, body_model=command.smpl_model, markers=command.markers, quiet=command.quiet

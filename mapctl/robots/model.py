@@ -1,10 +1,11 @@
-"""The kinematic model of a robot: links, hinges and their limits, read from MJCF or URDF by MuJoCo (Todorov et al. 2012),
-and which of its links is which part of a person.
+"""The kinematic model of a robot: links, hinges and their limits, read from MJCF or URDF by MuJoCo (Todorov et al.
+2012), and which of its links is which part of a person.
 
 All link frames are aligned with the robot's world, Z up and X ahead, where its joint angles are zero: a hinge turns its
 link by a rotation vector along its axis, and the robot is a skeleton like any other.
 """
 
+import importlib
 import xml.etree.ElementTree as ElementTree
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -29,7 +30,7 @@ from mapctl.retarget import RigMap, identify_rig
 from mapctl.retarget.character import RiggedCharacter, Stance
 from mapctl.retarget.joint_matching import REQUIRED
 from mapctl.retarget.rigs import Rig
-from mapctl.skeleton import CANONICAL, Skeleton
+from mapctl.skeleton import Skeleton
 
 _LIMB_PARTS = {
     Part.HIPS: "UpperLeg",
@@ -135,12 +136,17 @@ def load(path: str | PathLike[str]) -> Robot:
     return _Tree(path, model).build(stated)
 
 
-def _compile(path: Path) -> Any:
-    """Compile a model, without its meshes where their files are not there."""
+def import_mujoco() -> Any:
+    """Import MuJoCo, which has no types; RequestError where it is not installed."""
     try:
-        import mujoco
+        return importlib.import_module("mujoco")
     except ImportError:
         raise RequestError("robots need MuJoCo: pip install 'mapctl[robot]'") from None
+
+
+def _compile(path: Path) -> Any:
+    """Compile a model, without its meshes where their files are not there."""
+    mujoco = import_mujoco()
     if not path.is_file():
         raise RequestError(f"{path}: no such file")
     try:
@@ -159,12 +165,11 @@ def _compile(path: Path) -> Any:
 
 
 class _Tree:
-    """Links of a model where all angles are zero. Of a body with several hinges each but the last has a link of its own;
-    a link's origin is on its hinge."""
+    """Links of a model where all angles are zero. Of a body with several hinges each but the last has a link of its
+    own; a link's origin is on its hinge."""
 
     def __init__(self, path: Path, model: Any):
-        import mujoco
-
+        mujoco = import_mujoco()
         self.path, self.model, self.data = path, model, mujoco.MjData(model)
         free = [int(model.jnt_qposadr[j]) for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE]
         self.data.qpos[:] = 0
@@ -221,16 +226,17 @@ class _Tree:
         speed = [speeds.get(joint, stated.speed or np.inf) for joint in joints]
         rig = Rig(self.path.stem, links, rest="straighten", up="z", facing="x")
         return Robot(
-            skeleton,
-            tuple(joints),
-            tuple(self.hinges),
-            torch.from_numpy(self.data.xaxis[self.turning]),
-            *ranges.unbind(dim=1),
-            torch.tensor(speed, dtype=torch.float64),
-            torch.from_numpy(np.stack(self.zero)),
-            (torch.from_numpy(soles[0]), torch.from_numpy(soles[1])),
-            identify_rig(skeleton, rig),
-            model,
+            skeleton=skeleton,
+            joints=tuple(joints),
+            hinges=tuple(self.hinges),
+            axes=torch.from_numpy(self.data.xaxis[self.turning]),
+            low=ranges[:, 0],
+            high=ranges[:, 1],
+            speed=torch.tensor(speed, dtype=torch.float64),
+            zero=torch.from_numpy(np.stack(self.zero)),
+            soles=(torch.from_numpy(soles[0]), torch.from_numpy(soles[1])),
+            rigmap=identify_rig(skeleton, rig),
+            model=model,
         )
 
     def _find_sole(self, foot: str, stated: _Stated) -> Float[np.ndarray, "corners 3"]:
@@ -246,7 +252,9 @@ class _Tree:
             points.append(data.geom_xpos[geom] + box @ data.geom_xmat[geom].reshape(3, 3).T)
         if not points:
             beside = self.path.with_suffix(".toml").name
-            raise FileFormatError(self.path, f"{foot} has no shape; give the corners of its sole under [soles] in {beside}")
+            raise FileFormatError(
+                self.path, f"{foot} has no shape; give the corners of its sole under [soles] in {beside}"
+            )
         low, high = (edge(np.concatenate(points), axis=0) - self.origins[link] for edge in (np.min, np.max))
         return np.array([(x, y, low[2]) for x in (low[0], high[0]) for y in (low[1], high[1])])
 
@@ -257,8 +265,8 @@ class _Tree:
         return link
 
     def _match_links(self) -> dict[str, str]:
-        """Match links with canonical joints by the words of their names: of those that turn, the last of a part; of
-        hips and shoulders that which is nearest to the point where their axes meet."""
+        """Match links with canonical joints by the words of their names: of a part the last that turns; of hips and
+        shoulders that which is nearest to the point where their axes meet."""
         roles = [classify_joint(name) for name in self.names]
         every = range(len(self.names))
         trunk = [link for link in every if roles[link] == Role(Side.MIDDLE, Part.TORSO)]
@@ -270,11 +278,11 @@ class _Tree:
         if heads:
             found["head"] = max(heads, key=lambda link: self.origins[link][2])
         groups: dict[str, list[int]] = defaultdict(list)
-        for link in self.hinges:
-            part = _LIMB_PARTS.get(roles[link].part)
-            if part is not None and roles[link].side is not Side.MIDDLE:
-                groups[roles[link].side.value + part].append(link)
-        for joint, links in groups.items():
+        for link, role in enumerate(roles):
+            if role.side is not Side.MIDDLE and role.part in _LIMB_PARTS:
+                groups[role.side.value + _LIMB_PARTS[role.part]].append(link)
+        for joint, named in groups.items():
+            links = [link for link in named if link in self.hinges] or named  # a hand may be fixed to its forearm
             balls = joint.endswith(_BALLS) and len(links) > 1
             found[joint] = min(links, key=self._measure_from_axes(links)) if balls else links[-1]
         return {joint: self.names[link] for joint, link in found.items()}

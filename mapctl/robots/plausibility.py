@@ -10,6 +10,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull
 from torch import Tensor
 
+from mapctl.robots.model import import_mujoco
 from mapctl.robots.retarget import RobotMotion
 
 _TOUCH = 0.001  # metres by which two links are in each other before it counts
@@ -83,9 +84,7 @@ def _pad(values: Float[Tensor, "fewer columns"], lost: int) -> Float[Tensor, "fr
 
 def _measure_bodies(motion: RobotMotion) -> tuple[Float[Tensor, " frames"], Float[Tensor, "frames 3"]]:
     """Measure how deep links are in each other, and the centre of mass, metres."""
-    import mujoco
-
-    model = motion.robot.model
+    mujoco, model = import_mujoco(), motion.robot.model
     data: Any = mujoco.MjData(model)
     addresses = [int(model.joint(name).qposadr[0]) for name in motion.robot.joints]
     base = int(next(body for body in range(1, model.nbody) if model.body_parentid[body] == 0))

@@ -11,8 +11,6 @@ angles. Limits of joints hold in each step: angles at a limit are fixed where th
 Newton, Bertsekas 1982). Speeds beyond a joint's are penalised, and what is left of them is cut in the end.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -25,6 +23,7 @@ from scipy.linalg import solveh_banded
 from torch import Tensor
 
 from mapctl import rotations
+from mapctl.kinematics.moving import rotate_world
 from mapctl.motion import Motion
 from mapctl.retarget.carry import Changes, find_ground, retarget_motion
 from mapctl.retarget.character import FEET, TOES
@@ -33,6 +32,7 @@ from mapctl.retarget.rigs import Rig
 from mapctl.robots.model import Robot
 from mapctl.skeleton import CANONICAL
 
+_TO_ROBOT = torch.tensor([0.5, 0.5, 0.5, 0.5], dtype=torch.float64)  # from Y up and Z ahead to Z up and X ahead
 _POSITION_ERRORS = {"hips": 0.03, "LowerLeg": 0.05, "Foot": 0.01, "LowerArm": 0.05, "Hand": 0.02}
 """Errors of observed positions, metres (standard deviation), by joint on either side."""
 _ORIENTATION_ERRORS = {"hips": 0.1, "chest": 0.15, "head": 0.2, "Foot": 0.15, "Hand": 0.4}
@@ -62,20 +62,20 @@ class RobotMotion:
     contacts: Bool[Tensor, "frames 2"]
     """Whether the left and the right foot stand."""
 
-    def slice(self, start: int, stop: int) -> RobotMotion:
+    def slice(self, start: int, stop: int) -> "RobotMotion":
         """Return frames start to stop."""
         tracks = {name: getattr(self, name)[start:stop] for name in _TRACKS}
         return replace(self, **tracks)
 
-    def join(self, after: RobotMotion) -> RobotMotion:
+    def join(self, after: "RobotMotion") -> "RobotMotion":
         """Return this motion with another one after it."""
         return replace(self, **{name: torch.cat([getattr(self, name), getattr(after, name)]) for name in _TRACKS})
 
     def to_motion(self) -> Motion:
-        """Return the links' motion, whose rig is that of the robot."""
+        """Return the links' motion, Y up, whose rig is that of the robot."""
         local = self.robot.rotate_links(self.orientation, self.angles)
         quats = rotations.make_sign_continuous(rotations.from_matrix(local))
-        return Motion(self.robot.skeleton, self.fps, self.position, quats)
+        return rotate_world(Motion(self.robot.skeleton, self.fps, self.position, quats), rotations.inverse(_TO_ROBOT))
 
     def chain_links(self) -> tuple[Float[Tensor, "frames links 3"], Float[Tensor, "frames links 3 3"]]:
         """Compute positions of all links in the world, metres, and their orientations."""
@@ -109,7 +109,7 @@ class Observations:
     orientation_weights: Float[Tensor, "frames observed"]
     standing: Bool[Tensor, "frames 2"]
 
-    def slice(self, start: int, stop: int) -> Observations:
+    def slice(self, start: int, stop: int) -> "Observations":
         """Return frames start to stop."""
         names = ("positions", "position_weights", "orientations", "orientation_weights", "standing")
         return replace(self, **{name: getattr(self, name)[start:stop] for name in names})
@@ -133,7 +133,7 @@ def retarget_to_robot(motion: Motion, robot: Robot, rig: Rig | None = None) -> t
     return _cut_speeds(done), carried.changes
 
 
-def observe(own: Motion, robot: Robot) -> Observations:
+def observe(own: Motion, robot: Robot) -> "Observations":
     """Observe links in a motion on the robot's bones, canonical joints, Y up."""
     found = list(_observe_joints(own, robot))
     links, points, *tracks, standing = zip(*found, strict=True)
@@ -144,13 +144,14 @@ def observe(own: Motion, robot: Robot) -> Observations:
     )
 
 
-def _observe_joints(own: Motion, robot: Robot) -> Iterator[tuple[int, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None]]:
+def _observe_joints(
+    own: Motion, robot: Robot
+) -> Iterator[tuple[int, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None]]:
     """Yield link, point, positions and weights, orientations and weights of each observed point; with the tip of a sole
     the frames in which it stands."""
     rigmap, frames = robot.rigmap, own.num_frames
-    upright = rigmap.upright_quat_xyzw
-    down = torch.tensor([0.0, 0.0, 0.0, 1.0]).double() if upright is None else rotations.inverse(upright)
-    turned, at = own.joint_rotations(), rotations.rotate(down.expand(frames, CANONICAL.num_joints, 4), own.joint_positions())
+    down = _TO_ROBOT.expand(frames, CANONICAL.num_joints, 4)
+    turned, at = own.joint_rotations(), rotations.rotate(down, own.joint_positions())
     spans, raised = find_ground(own, robot.character.stance)
     origin, nothing = torch.zeros(3, dtype=torch.float64), torch.zeros(frames, dtype=torch.float64)
     for joint, name in enumerate(CANONICAL.names):
@@ -160,11 +161,11 @@ def _observe_joints(own: Motion, robot: Robot) -> Iterator[tuple[int, Tensor, Te
         if link is None or errors == [math.inf, math.inf] or (name == "head" and not _turns(robot, "chest", link)):
             continue
         weight, turn_weight = (torch.full((frames,), error**-2, dtype=torch.float64) for error in errors)
-        tpose = rotations.multiply(down, rigmap.tpose_quat_xyzw[joint])
 
-        def orient(quats: Tensor, joint: int = joint) -> Tensor:
-            placed = rotations.multiply(quats, rigmap.tpose_quat_xyzw[joint].expand(frames, 4))
-            return rotations.to_matrix(rotations.multiply(down.expand(frames, 4), placed))
+        def orient(quats: Tensor, tpose: Tensor = rigmap.tpose_quat_xyzw[joint]) -> Tensor:
+            return rotations.to_matrix(
+                rotations.multiply(down[:, 0], rotations.multiply(quats, tpose.expand(frames, 4)))
+            )
 
         orientation = orient(turned[:, joint])
         if part == "Foot":
@@ -202,13 +203,15 @@ class _Foot:
     """Radians; constant where it is flat."""
 
     @staticmethod
-    def of(own: Motion, robot: Robot, side: int, touching: Spans) -> _Foot:
+    def of(own: Motion, robot: Robot, side: int, touching: Spans) -> "_Foot":
         turns, positions = own.joint_rotations()[:, FEET[side]], own.joint_positions()
         upward = rotations.rotate(turns, torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))[:, 1]
         spans = [(start, stop) for start, stop in touching if float(upward[start:stop].mean()) > _SOLE_DOWN]
         stands = torch.zeros(own.num_frames, dtype=torch.bool)
         heading = rotations.unwrap_angle(rotations.split_heading(turns)[0])
-        height = positions[:, FEET[side], 1] - positions[:, TOES[side], 1] + robot.rigmap.skeleton.offsets[TOES[side], 1]
+        height = (
+            positions[:, FEET[side], 1] - positions[:, TOES[side], 1] + robot.rigmap.skeleton.offsets[TOES[side], 1]
+        )
         flat = (upward > _LEVEL) & (height < _HEEL_METRES)
         for start, stop in spans:
             stands[start:stop] = True
@@ -218,13 +221,13 @@ class _Foot:
         return _Foot(spans, stands, flat & stands, heading)
 
 
-def _start(robot: Robot, seen: Observations, fps: Fraction) -> RobotMotion:
+def _start(robot: Robot, seen: Observations, fps: Fraction) -> "RobotMotion":
     """Return the start of a search: the base as observed, all joints at zero."""
     angles = torch.zeros(len(seen.positions), len(robot.joints), dtype=torch.float64).clamp(robot.low, robot.high)
     return RobotMotion(robot, fps, seen.positions[:, 0].clone(), seen.orientations[:, 0].clone(), angles, seen.standing)
 
 
-def _minimise(now: RobotMotion, seen: Observations, held: int) -> RobotMotion:
+def _minimise(now: RobotMotion, seen: Observations, held: int) -> "RobotMotion":
     """Minimise the cost over all frames but the first, which are held."""
     damping, system = 1e-3, _System.of(now, seen)
     for _ in range(_ITERATIONS):
@@ -262,7 +265,7 @@ class _System:
     """Weight of squared third differences."""
 
     @staticmethod
-    def of(now: RobotMotion, seen: Observations) -> _System:
+    def of(now: RobotMotion, seen: Observations) -> "_System":
         """Linearise all terms at a motion."""
         robot, fps = now.robot, float(now.fps)
         at, world = robot.chain_links(now.orientation, now.angles)
@@ -295,7 +298,7 @@ class _System:
         gradient[:-1, 6:] += coupling * beyond
         return _System(float(cost), hessian, coupling.double(), gradient, jerk)
 
-    def step(self, now: RobotMotion, damping: float, held: int) -> RobotMotion:
+    def step(self, now: RobotMotion, damping: float, held: int) -> "RobotMotion":
         """Solve for the next motion."""
         robot, (frames, size) = now.robot, self.gradient.shape
         free = torch.ones(frames, size, dtype=torch.bool)
@@ -348,7 +351,7 @@ def _differentiate(
     return torch.cat([by_position, by_rotation], dim=1).mT.flatten(1, 2)
 
 
-def _cut_speeds(found: RobotMotion) -> RobotMotion:
+def _cut_speeds(found: RobotMotion) -> "RobotMotion":
     """Cut what is left of speeds beyond the joints'."""
     most = found.robot.speed / float(found.fps)
     if not (found.angles.diff(dim=0).abs() > most).any():
