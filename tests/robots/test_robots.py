@@ -4,7 +4,6 @@ import json
 from dataclasses import replace
 from fractions import Fraction
 
-import mujoco
 import numpy as np
 import pytest
 import torch
@@ -66,6 +65,7 @@ def test_links_limits_and_soles_are_those_of_the_model(make, tmp_path):
 def test_links_are_where_mujoco_has_them(robot):
     pose = random_pose(robot)
     at, world = pose.chain_links()
+    mujoco = model.import_mujoco()
     data = mujoco.MjData(robot.model)
     for frame in range(len(pose.angles)):
         data.qpos[:3] = pose.position[frame]
