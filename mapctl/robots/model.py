@@ -104,6 +104,12 @@ class Robot:
                 found[link, self.hinges.index(link)] = True
         return found
 
+    @property
+    def corner_links(self) -> list[int]:
+        """The link of each corner of the soles."""
+        feet = (self.rigmap.joints[f"{side}Foot"] for side in ("left", "right"))
+        return [foot for foot, sole in zip(feet, self.soles, strict=True) for _ in sole]
+
     def find_link(self, joint: str) -> int | None:
         """Find the link that is a canonical joint, None if there is none."""
         return self.rigmap.joints.get(joint)

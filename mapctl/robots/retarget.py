@@ -37,7 +37,8 @@ _POSITION_ERRORS = {"hips": 0.03, "LowerLeg": 0.05, "Foot": 0.01, "LowerArm": 0.
 """Errors of observed positions, metres (standard deviation), by joint on either side."""
 _ORIENTATION_ERRORS = {"hips": 0.1, "chest": 0.15, "head": 0.2, "Foot": 0.15, "Hand": 0.4}
 """Errors of observed orientations, radians."""
-_STANDING_ERROR, _FLAT_ERROR = 0.0003, 0.003  # metres of the tip of a sole that stands, radians of a foot that is flat
+_STANDING_ERROR, _FLAT_ERROR = 0.0001, 0.002  # metres of the tip of a sole that stands, radians of a foot that is flat
+_SUNK_ERROR = 0.003  # metres by which corners of soles are under the floor
 _SOLE_DOWN, _LEVEL = 0.5, 0.9  # least cosine between the vertical and a foot that stands, and one that is flat
 _HEEL_METRES = 0.015  # over its height on a flat foot, within which an ankle's heel is down
 _ANGLE_ERROR = 1.0  # radians by which joints are away from zero, if nothing shows it
@@ -167,21 +168,18 @@ def _observe_joints(
                 rotations.multiply(down[:, 0], rotations.multiply(quats, tpose.expand(frames, 4)))
             )
 
-        orientation = orient(turned[:, joint])
+        orientation, moved = orient(turned[:, joint]), origin
         if part == "Foot":
             side = FEET.index(joint)
             foot = _Foot.of(own, robot, side, spans[side])
             orientation = torch.where(foot.flat[:, None, None], orient(rotations.about_y(foot.heading)), orientation)
             turn_weight = torch.where(foot.flat, _FLAT_ERROR**-2, turn_weight)
-            tip = at[:, TOES[side]].clone()
-            for start, stop in foot.spans:
-                tip[start:stop] = tip[start:stop].mean(dim=0)
-                tip[start:stop, 2] = raised[start, side]
+            moved = foot.hold(at[:, TOES[side]], raised[:, side])
             tip_weight = torch.where(foot.stands, _STANDING_ERROR**-2, weight)
             end = torch.tensor(robot.skeleton.end_offsets[robot.skeleton.names[link]], dtype=torch.float64)
-            yield link, end, tip, tip_weight, orientation, turn_weight, foot.stands
+            yield link, end, at[:, TOES[side]] + moved, tip_weight, orientation, turn_weight, foot.stands
             weight, turn_weight = torch.where(foot.stands, 0.0, weight), nothing
-        yield link, origin, at[:, joint], weight, orientation, turn_weight, None
+        yield link, origin, at[:, joint] + moved, weight, orientation, turn_weight, None
 
 
 def _turns(robot: Robot, below: str, link: int) -> bool:
@@ -219,6 +217,20 @@ class _Foot:
             if lies.any():
                 heading[start:stop] = heading[start:stop][lies].mean()
         return _Foot(spans, stands, flat & stands, heading)
+
+    def hold(self, tips: Float[Tensor, "frames 3"], floor: Float[Tensor, " frames"]) -> Float[Tensor, "frames 3"]:
+        """Return by how much tips have to move, Z up, to be at one point of the floor while they stand, and go evenly
+        from one stance to the next."""
+        moved = torch.zeros_like(tips)
+        for start, stop in self.spans:
+            held = tips[start:stop].mean(dim=0)
+            held[2] = floor[start]
+            moved[start:stop] = held - tips[start:stop]
+        if self.spans:
+            frames, known = np.arange(len(tips)), self.stands.nonzero()[:, 0].numpy()
+            tracks = [np.interp(frames, known, moved[known, axis].numpy()) for axis in range(3)]
+            moved = torch.from_numpy(np.stack(tracks, axis=1))
+        return moved
 
 
 def _start(robot: Robot, seen: Observations, fps: Fraction) -> "RobotMotion":
@@ -269,14 +281,29 @@ class _System:
         """Linearise all terms at a motion."""
         robot, fps = now.robot, float(now.fps)
         at, world = robot.chain_links(now.orientation, now.angles)
-        points = at[:, seen.links] + (world[:, seen.links] @ seen.points[..., None])[..., 0]
+        links, observed = [*seen.links, *robot.corner_links], len(seen.links)
+        points = at[:, links] + (world[:, links] @ torch.cat([seen.points, *robot.soles])[..., None])[..., 0]
+        missed = seen.positions - points[:, :observed] - now.position[:, None]
         away = seen.orientations @ world[:, seen.links].mT
         turned = rotations.to_rotation_vector(rotations.from_matrix(away))
-        residual = torch.cat([seen.positions - points - now.position[:, None], turned], dim=1)
-        weights = torch.cat([seen.position_weights, seen.orientation_weights], dim=1)[..., None].expand_as(residual)
-        jacobian = _differentiate(robot, seen.links, points, at, world)
-        weighted = jacobian * weights.flatten(1)[..., None]
-        hessian, gradient = weighted.mT @ jacobian, (weighted.mT @ residual.flatten(1)[..., None])[..., 0]
+        sunk = (-points[:, observed:, 2] - now.position[:, None, 2]).clamp_min(0)
+        position_weights, orientation_weights = (
+            weights[..., None].expand_as(missed).flatten(1)
+            for weights in (seen.position_weights, seen.orientation_weights)
+        )
+        residual = torch.cat([missed.flatten(1), turned.flatten(1), sunk], dim=1)
+        weights = torch.cat([position_weights, orientation_weights, (sunk > 0) / _SUNK_ERROR**2], dim=1)
+        by_position, by_rotation = _differentiate(robot, links, points, at, world)
+        jacobian = torch.cat(
+            [
+                by_position[:, :observed].flatten(1, 2),
+                by_rotation[:, :observed].flatten(1, 2),
+                by_position[:, observed:, 2],
+            ],
+            dim=1,
+        )
+        weighted = jacobian * weights[..., None]
+        hessian, gradient = weighted.mT @ jacobian, (weighted.mT @ residual[..., None])[..., 0]
         cost = (weights * residual.square()).sum() + (now.angles / _ANGLE_ERROR).square().sum()
         joints = range(6, gradient.shape[1])
         hessian[:, joints, joints] += _ANGLE_ERROR**-2
@@ -338,17 +365,17 @@ def _differentiate(
     points: Float[Tensor, "frames observed 3"],
     at: Float[Tensor, "frames links 3"],
     world: Float[Tensor, "frames links 3 3"],
-) -> Float[Tensor, "frames rows unknowns"]:
+) -> tuple[Float[Tensor, "frames observed 3 unknowns"], Float[Tensor, "frames observed 3 unknowns"]]:
     """Differentiate points on links, about the base, and the links' orientations by the unknowns."""
     hinges = list(robot.hinges)
     moved = robot.above[links][..., None].double()
     axes = (world[:, hinges] @ robot.axes[..., None])[:, None, ..., 0] * moved
     one = torch.eye(3, dtype=torch.float64).expand(*points.shape, 3)
     levers = torch.linalg.cross(one, points[..., None, :].expand_as(one))
-    swung = torch.linalg.cross(axes, (points[:, :, None] - at[:, None, hinges]))
+    swung = torch.linalg.cross(axes, points[:, :, None] - at[:, None, hinges])
     by_position = torch.cat([one, levers, swung], dim=2)
     by_rotation = torch.cat([torch.zeros_like(one), one, axes], dim=2)
-    return torch.cat([by_position, by_rotation], dim=1).mT.flatten(1, 2)
+    return by_position.mT, by_rotation.mT
 
 
 def _cut_speeds(found: RobotMotion) -> "RobotMotion":
