@@ -15,6 +15,7 @@ COMMANDS = {
     "steer": ("Steer", "A character follows a script of speeds and directions, as in live steering."),
     "live": ("Live", "Steer characters in a browser on this machine: sliders, keys, drawn paths, recording."),
     "smooth": ("Smooth", "Smooth a tracker's poses live, between tracker and viewer, over the VMC protocol."),
+    "drive": ("Drive", "A robot does at once what a character does whose poses come over the VMC protocol."),
     "denoise": ("Denoise", "Denoise a capture with noise, sliding and gaps, or a folder of them."),
     "infill": ("Infill", "Fill in missing frames or joints of a motion; all else stays as it was."),
     "tween": ("Tween", "The motion between keyframes: frames of a clip, or poses of a file."),

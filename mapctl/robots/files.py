@@ -41,11 +41,16 @@ def save(motion: RobotMotion, path: str | PathLike[str], *, header: bool = False
     if ending == ".npz":
         np.savez_compressed(written, allow_pickle=False, **_collect_arrays(motion))
     else:
-        quats = rotations.from_matrix(motion.orientation @ motion.robot.zero[0])
-        rows = torch.cat([motion.position, rotations.make_sign_continuous(quats), motion.angles], dim=1)
+        rows = build_rows(motion)
         names = ",".join((*_BASE, *motion.robot.joints)) if header else ""
         np.savetxt(written, rows.numpy(), fmt="%.6f", delimiter=",", header=names, comments="")
     write_bytes(path, written.getvalue())
+
+
+def build_rows(motion: RobotMotion) -> Float[Tensor, "frames columns"]:
+    """Return the numbers of each frame's row: base and angles."""
+    quats = rotations.from_matrix(motion.orientation @ motion.robot.zero[0])
+    return torch.cat([motion.position, rotations.make_sign_continuous(quats), motion.angles], dim=1)
 
 
 def _collect_arrays(motion: RobotMotion) -> dict[str, np.ndarray]:

@@ -63,7 +63,7 @@ class RobotMotion:
     contacts: Bool[Tensor, "frames 2"]
     """Whether the left and the right foot stand."""
 
-    def slice(self, start: int, stop: int) -> "RobotMotion":
+    def slice(self, start: int, stop: int | None) -> "RobotMotion":
         """Return frames start to stop."""
         tracks = {name: getattr(self, name)[start:stop] for name in _TRACKS}
         return replace(self, **tracks)
@@ -110,6 +110,11 @@ class Observations:
     orientation_weights: Float[Tensor, "frames observed"]
     standing: Bool[Tensor, "frames 2"]
 
+    @property
+    def tips(self) -> list[int]:
+        """Which of the observed points are the tips of the left and the right sole."""
+        return [number for number, point in enumerate(self.points) if point.any()]
+
     def slice(self, start: int, stop: int) -> "Observations":
         """Return frames start to stop."""
         names = ("positions", "position_weights", "orientations", "orientation_weights", "standing")
@@ -125,10 +130,10 @@ def retarget_to_robot(motion: Motion, robot: Robot, rig: Rig | None = None) -> t
     while stop < motion.num_frames:
         start, held = max(0, stop - _OVERLAP), min(_HELD, stop)
         stop = min(motion.num_frames, start + _WINDOW)
-        part = _start(robot, seen.slice(start, stop), motion.fps)
+        part = start_search(robot, seen.slice(start, stop), motion.fps)
         if done is not None:
             part = done.slice(start, done.angles.shape[0]).join(part.slice(_OVERLAP, stop - start))
-        part = _minimise(part, seen.slice(start, stop), held)
+        part = minimise(part, seen.slice(start, stop), held)
         done = part if done is None else done.slice(0, start).join(part)
     assert done is not None
     return _cut_speeds(done), carried.changes
@@ -233,16 +238,16 @@ class _Foot:
         return moved
 
 
-def _start(robot: Robot, seen: Observations, fps: Fraction) -> "RobotMotion":
+def start_search(robot: Robot, seen: Observations, fps: Fraction) -> "RobotMotion":
     """Return the start of a search: the base as observed, all joints at zero."""
     angles = torch.zeros(len(seen.positions), len(robot.joints), dtype=torch.float64).clamp(robot.low, robot.high)
     return RobotMotion(robot, fps, seen.positions[:, 0].clone(), seen.orientations[:, 0].clone(), angles, seen.standing)
 
 
-def _minimise(now: RobotMotion, seen: Observations, held: int) -> "RobotMotion":
-    """Minimise the cost over all frames but the first, which are held."""
+def minimise(now: RobotMotion, seen: Observations, held: int, *, iterations: int | None = None) -> RobotMotion:
+    """Minimise the cost over all frames but the first, which are held; of a search from near, few iterations do."""
     damping, system = 1e-3, _System.of(now, seen)
-    for _ in range(_ITERATIONS):
+    for _ in range(iterations or _ITERATIONS):
         while True:
             tried = system.step(now, damping, held)
             found = _System.of(tried, seen)

@@ -281,7 +281,7 @@ class PoseStream:
 def pack(messages: Sequence[Message]) -> list[bytes]:
     """Pack the messages of a frame, the time last, into packets. Each begins with that time, by which a receiver finds
     the packets of a frame."""
-    return bundle(map(_build, messages), _build(Message(FRAME, messages[-1].arguments)))
+    return bundle(map(encode, messages), encode(Message(FRAME, messages[-1].arguments)))
 
 
 def bundle(packed: Iterable[bytes], opening: bytes = b"") -> list[bytes]:
@@ -299,7 +299,8 @@ def _add_length(packed: bytes) -> bytes:
     return len(packed).to_bytes(4, "big") + packed
 
 
-def _build(message: Message) -> bytes:
+def encode(message: Message) -> bytes:
+    """Return the bytes of a message."""
     if message.packed:
         return message.packed
     builder = OscMessageBuilder(message.address)

@@ -63,15 +63,14 @@ def measure(done: RobotMotion, seen: Observations, milliseconds: float) -> dict[
     points = at[:, seen.links] + (world[:, seen.links] @ seen.points[..., None])[..., 0]
     missed = 100 * (points - seen.positions).norm(dim=-1)
     names = [done.robot.skeleton.names[link] for link in seen.links]
-    tips = [n for n, point in enumerate(seen.points) if point.norm() > 0]
     hands = [
         names.index(done.robot.skeleton.names[done.robot.rigmap.joints[f"{side}Hand"]]) for side in ("left", "right")
     ]
     stays = done.contacts[1:] & done.contacts[:-1]
-    speed = 100 * float(done.fps) * points[:, tips].diff(dim=0).norm(dim=-1)[stays]
+    speed = 100 * float(done.fps) * points[:, seen.tips].diff(dim=0).norm(dim=-1)[stays]
     jerk = done.angles.diff(n=3, dim=0).abs().mean() * float(done.fps) ** 3
     return {
-        "feet, cm": float(missed[:, tips].mean()),
+        "feet, cm": float(missed[:, seen.tips].mean()),
         "hands, cm": float(missed[:, hands].mean()),
         "standing tips, cm/s": float(speed.mean()) if len(speed) else 0.0,
         "fastest, cm/s": float(speed.max()) if len(speed) else 0.0,

@@ -12,11 +12,14 @@ from robot_maker import RANGES, list_joints, make_mjcf, make_urdf
 
 import mapctl
 from mapctl import formats, rotations
+from mapctl.commands.drive import Driver
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.retarget.carry import retarget_motion
 from mapctl.robots import files, model, plausibility
 from mapctl.robots import retarget as solver
+from mapctl.robots.following import DELAY_FRAMES
 from mapctl.robots.retarget import RobotMotion, observe, retarget_to_robot
+from mapctl.streaming.sender import encode_frame
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +85,7 @@ def test_gradient_and_hessian_are_those_of_the_cost(robot):
     """Against central differences of the cost, whose residuals are smooth there."""
     seen = observe(retarget_motion(walk(8), robot.character).motion, robot)
     pose = random_pose(robot, 8)
-    near = solver._start(robot, seen, Fraction(30))
+    near = solver.start_search(robot, seen, Fraction(30))
     pose = replace(near, angles=near.angles + 0.1 * pose.angles, position=near.position + 0.01)
     system, step = solver._System.of(pose, seen), 1e-5
 
@@ -110,12 +113,11 @@ def test_a_walk_stays_within_limits_with_feet_that_stand(robot, walked):
     seen = observe(retarget_motion(walk(90), robot.character).motion, robot)
     at, world = walked.chain_links()
     points = at[:, seen.links] + (world[:, seen.links] @ seen.points[..., None])[..., 0]
-    tips = [n for n, point in enumerate(seen.points) if point.norm() > 0]
     stays = walked.contacts[1:] & walked.contacts[:-1]
     assert float(stays.double().mean()) > 0.15
-    slide = 30 * points[:, tips].diff(dim=0).norm(dim=-1)[stays]
+    slide = 30 * points[:, seen.tips].diff(dim=0).norm(dim=-1)[stays]
     assert float(slide.mean()) < 0.01
-    assert float((points - seen.positions).norm(dim=-1)[:, tips].mean()) < 0.02
+    assert float((points - seen.positions).norm(dim=-1)[:, seen.tips].mean()) < 0.02
     soles = torch.cat(walked.find_soles(), dim=1)
     assert float(soles[..., 2].min()) > -0.02
     assert float(walked.position[-1, 0] - walked.position[0, 0]) > 1.0  # X ahead
@@ -125,11 +127,11 @@ def test_motion_is_smoother_than_frames_alone(robot, walked):
     """The same targets without a prior of jerk: each frame alone."""
     jerk = solver._JERKS
     seen = observe(retarget_motion(walk(30), robot.character).motion, robot)
-    start = solver._start(robot, seen, Fraction(30))
-    together = solver._minimise(start, seen, 0)
+    start = solver.start_search(robot, seen, Fraction(30))
+    together = solver.minimise(start, seen, 0)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(solver, "_JERKS", tuple(1e6 * value for value in jerk))
-        alone = solver._minimise(start, seen, 0)
+        alone = solver.minimise(start, seen, 0)
     assert float(together.angles.diff(n=3, dim=0).abs().mean()) < 0.7 * float(
         alone.angles.diff(n=3, dim=0).abs().mean()
     )
@@ -275,3 +277,20 @@ def test_a_header_is_for_robots_alone(tmp_path, capsys):
     formats.save(walk(20), tmp_path / "walk.bvh")
     assert run("convert", tmp_path / "walk.bvh", tmp_path / "out.bvh", "--header") == 2
     assert "--robot" in capsys.readouterr().err
+
+
+def test_a_robot_follows_a_stream_as_it_would_the_whole(robot):
+    """Frames over VMC, three at a time: limits, feet and the pose are those of a clip that is known whole."""
+    clip, driver, rows = walk(90), Driver(robot), []
+    for frame in range(90):
+        pose = (clip.root_position[frame].numpy(), clip.local_quat_xyzw[frame].numpy())
+        rows += driver.take(encode_frame(clip.skeleton, *pose, frame / 30))
+    assert len(rows) == 90 - DELAY_FRAMES
+    numbers = torch.tensor([message.arguments for message in rows], dtype=torch.float64)
+    np.testing.assert_allclose(numbers[:, 0], np.arange(84) / 30, atol=1e-6)
+    whole = retarget_to_robot(clip, robot)[0]
+    angles = numbers[:, 8:]
+    assert bool(((angles >= robot.low) & (angles <= robot.high)).all())
+    assert float((numbers[30:, 1:4] - whole.position[30:84]).norm(dim=1).mean()) < 0.03
+    assert float((angles - whole.angles[:84])[30:].abs().mean()) < 0.1
+    assert float(angles.diff(n=3, dim=0).abs().mean()) < 2 * float(whole.angles.diff(n=3, dim=0).abs().mean())
