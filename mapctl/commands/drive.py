@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 ADDRESS = "/mapctl/robot"
 """Address of a frame: the stream's time, then the numbers of a row of a robot's .csv."""
-_FRAMES = 3  # that are solved at once, as steering computes them
+_FRAMES, _MOST_FRAMES = 3, 15  # that are solved at once, as steering computes them; where it is behind, all that came
 _PARSE_SECONDS = 0.05
 
 
@@ -74,7 +74,7 @@ class Driver:
         self._robot, self._assembler = robot, FrameAssembler()
         self._waiting: list[VmcFrame] = []
         self._follower: RobotFollower | None = None
-        self._times: deque[float] = deque(maxlen=DELAY_FRAMES + _FRAMES)
+        self._times: deque[float] = deque(maxlen=DELAY_FRAMES + _MOST_FRAMES)
 
     def take(self, messages: list[Message]) -> list[Message]:
         """Take what came; return the robot's frames, DELAY_FRAMES behind."""
@@ -82,7 +82,7 @@ class Driver:
         self._waiting += frames
         if len(self._waiting) < _FRAMES:
             return []
-        given, self._waiting = self._waiting[:_FRAMES], self._waiting[_FRAMES:]
+        given, self._waiting = self._waiting[-_MOST_FRAMES:], []
         offsets = torch.from_numpy(given[0].bone_positions)
         if self._follower is None:
             skeleton = replace(CANONICAL, offsets=torch.cat([torch.zeros(1, 3, dtype=torch.float64), offsets[1:]]))
@@ -97,7 +97,8 @@ class Driver:
         found = self._follower.push(root + rotations.rotate(turn, hips), quats)
         if found is None:
             return []
-        times = list(self._times)[: len(found.angles)]
+        count = len(found.angles)
+        times = list(self._times)[-DELAY_FRAMES - count : -DELAY_FRAMES]
         return [Message(ADDRESS, (at, *row)) for at, row in zip(times, build_rows(found).tolist(), strict=True)]
 
 
@@ -111,5 +112,5 @@ def _drive(driver: Driver, receiver: "OscReceiver", out: socket.socket, to: tupl
         while waiting and now >= due:  # in even steps: frames are solved several at once
             with suppress(OSError):
                 out.sendto(bundle([encode(waiting.popleft())])[0], to)
-            due = max(due + 1 / PRIOR_FPS, now - 1 / PRIOR_FPS)
+            due = max(due + 1 / PRIOR_FPS, now + 0.5 / PRIOR_FPS)
         receiver.wait(max(0.0, due - now) if waiting else 1.0)
