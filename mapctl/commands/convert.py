@@ -291,7 +291,8 @@ def run(command: Convert) -> int:
         report.write_report(found, command.report)
     if not command.quiet:
         rate = f"{float(done.motion.fps):.6g} frames a second"
-        size = f"{done.motion.num_frames} frames, {done.motion.num_joints} joints"
+        joints = done.motion.num_joints if done.robot is None else len(done.robot.robot.joints)
+        size = f"{done.motion.num_frames} frames, {joints} joints"
         lines = [f"{command.out}: {size}, {rate}", *done.lines]
         print("\n".join([*lines, _describe_robot(seconds)] if seconds else lines))
     return 0

@@ -37,7 +37,7 @@ _POSITION_ERRORS = {"hips": 0.03, "LowerLeg": 0.05, "Foot": 0.01, "LowerArm": 0.
 """Errors of observed positions, metres (standard deviation), by joint on either side."""
 _ORIENTATION_ERRORS = {"hips": 0.1, "chest": 0.15, "head": 0.2, "Foot": 0.15, "Hand": 0.4}
 """Errors of observed orientations, radians."""
-_STANDING_ERROR, _FLAT_ERROR = 0.0001, 0.002  # metres of the tip of a sole that stands, radians of a foot that is flat
+_STANDING_ERROR, _FLAT_ERROR = 0.0001, 0.02  # metres of the tip of a sole that stands, radians of a foot that is flat
 _SUNK_ERROR = 0.003  # metres by which corners of soles are under the floor
 _SOLE_DOWN, _LEVEL = 0.5, 0.9  # least cosine between the vertical and a foot that stands, and one that is flat
 _HEEL_METRES = 0.015  # over its height on a flat foot, within which an ankle's heel is down
