@@ -23,18 +23,9 @@ import tyro
 
 from mapctl import __version__
 from mapctl.commands import COMMANDS, MANY_THREADS, SUBCOMMANDS, load_command
-from mapctl.commands.shared.command import INTERRUPTED, INVALID, SIGNALLED, UNREAD, use_single_thread
+from mapctl.commands.shared.command import INTERRUPTED, INVALID, SIGNALLED, UNREAD, describe_error, use_single_thread
 from mapctl.errors import MapctlError, RequestError
 
-_EXTRAS = {
-    "render": {"pyrender", "trimesh", "OpenGL", "av", "PIL", "matplotlib"},
-    "live": {"viser"},
-    "usd": {"pxr"},
-    "fbx": {"ufbx"},
-    "stream": {"pythonosc"},
-    "cluster": {"ray"},
-}
-"""Packages by the extra that installs them."""
 _ANSI_COLOUR = re.compile(r"\x1b\[[\d;]*m")
 _HINT = re.compile(r"Available subcommands: .*|Perhaps you meant: -[\w-]+")
 _MESSAGE_REWRITES = (
@@ -62,18 +53,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         if status == INTERRUPTED:
             status = _report_interruption(received, "what was solved until then is written")
-    except MapctlError as error:
-        status = _print_error(str(error), INVALID)
     except KeyboardInterrupt as stop:
         status = _report_interruption(received, str(stop))
-    except ModuleNotFoundError as error:
-        status = _print_error(_describe_missing_package(error.name or str(error)), INVALID)
     except BrokenPipeError:
         _discard_output()
         status = UNREAD
-    except OSError as error:
-        _discard_output()
-        status = _print_error(f"{error.filename or 'input or output'}: {error.strerror or error}", INVALID)
+    except (MapctlError, ModuleNotFoundError, OSError) as error:
+        if isinstance(error, OSError):
+            _discard_output()
+        status = _print_error(describe_error(error), INVALID)
     return status
 
 
@@ -142,14 +130,6 @@ def _shorten_usage_error(box: str) -> str:
     # An option that is another command's is like itself.
     shown = (hint.group() for hint in hints if hint.group().rpartition(" ")[2] not in first.split())
     return ". ".join([first.strip().rstrip("."), *shown])
-
-
-def _describe_missing_package(module: str) -> str:
-    package = module.partition(".")[0]
-    for extra, packages in _EXTRAS.items():
-        if package in packages:
-            return f"this needs the package {package}: pip install 'mapctl[{extra}]'"
-    return f"this needs the package {package}, which is not installed"
 
 
 def _raise_on_signals() -> list[int]:

@@ -26,6 +26,7 @@ COMMANDS = {
     "measure": ("Measure", "Path, feet, jitter and more of a motion, beside a reference clip and mocap."),
     "train": ("Train", "Train a model on a folder of BVH."),
     "info": ("Info", "Bundled models, licences, scenes and versions; or a clip and its rig."),
+    "mcp": ("ServeTools", "Serve info, shot, denoise, measure and contact sheet to an assistant, over MCP."),
     "compile": ("CompileKernels", "Compile the kernels and keep them on disk, so that the first motion does not wait."),
     "blender-addon": ("BlenderAddon", "Write the add-on for Blender 4.2 and later."),
     "bench": ("Bench", "Cost on this machine: energy and gradient of a window, following a curve, steering."),

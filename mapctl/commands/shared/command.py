@@ -42,6 +42,31 @@ def conclude(status: "Status", *, strict: bool) -> int:
     return NOT_SATISFIED if strict and not status.ok else 0
 
 
+_EXTRAS = {
+    "render": {"pyrender", "trimesh", "OpenGL", "av", "PIL", "matplotlib"},
+    "live": {"viser"},
+    "usd": {"pxr"},
+    "fbx": {"ufbx"},
+    "stream": {"pythonosc"},
+    "cluster": {"ray"},
+    "mcp": {"mcp"},
+}
+"""Packages by the extra that installs them."""
+
+
+def describe_error(error: Exception) -> str:
+    """Describe an error that a command raises on purpose, or for a file or a package, in the line that is printed."""
+    if isinstance(error, ModuleNotFoundError):
+        package = (error.name or str(error)).partition(".")[0]
+        for extra, packages in _EXTRAS.items():
+            if package in packages:
+                return f"this needs the package {package}: pip install 'mapctl[{extra}]'"
+        return f"this needs the package {package}, which is not installed"
+    if isinstance(error, OSError):
+        return f"{error.filename or 'input or output'}: {error.strerror or error}"
+    return " ".join(str(error).split())
+
+
 class Command:
     """Base of the frozen dataclasses of options; the function `run` beside them does the work."""
 
