@@ -32,6 +32,8 @@ from mapctl.streaming.post import StreamStatistics, run_post
 
 OK, TIME, ROOT, BONE = "/VMC/Ext/OK", "/VMC/Ext/T", "/VMC/Ext/Root/Pos", "/VMC/Ext/Bone/Pos"
 """Addresses: whether there is a character, the stream's time, the character's root, and one bone."""
+APPLY = "/VMC/Ext/Blend/Apply"
+"""Address that applies blend shapes, of which there are none: some receivers take it for the end of a frame."""
 BONE_NAMES = tuple(name[0].upper() + name[1:] for name in CANONICAL.names)
 """Names of the canonical joints in Unity, in their order. There is no UpperChest: the neck hangs from the chest."""
 FRAME, CONTACTS, VELOCITY, FORECAST = (f"/mapctl/{name}" for name in ("frame", "contacts", "root_velocity", "forecast"))
@@ -135,7 +137,7 @@ def encode_frame(
     values = np.concatenate([positions, quats_xyzw], axis=-1) * MIRROR
     root = (*(ground * MIRROR[:3]).tolist(), 0.0, 0.0, 0.0, 1.0)
     bones = [Message(BONE, (name, *row)) for name, row in zip(BONE_NAMES, values.tolist(), strict=True)]
-    ends = [Message(OK, AVAILABLE), Message(TIME, (float(seconds),))]
+    ends = [Message(APPLY), Message(OK, AVAILABLE), Message(TIME, (float(seconds),))]
     return [Message(ROOT, (_ROOT_NAME, *root)), *bones, *(guidance.encode() if guidance else ()), *ends]
 
 
