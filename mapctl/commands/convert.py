@@ -57,8 +57,8 @@ class Convert(Command, options.ReadOptions):
     robot: options.MaybeFile = None
     """Robot that moves as the person does, as MJCF or URDF: OUT is a .csv (a row a frame: position of the base, its
     quaternion xyzw, joint angles in the model's order) or an .npz (also velocities, bodies and contacts). With such
-    a .csv as IN: the robot that it is of. A .toml of the same name beside the model names the links that are not
-    recognised."""
+    a .csv as IN: the robot that it is of. A .toml of the same name beside the model overrules which of its links
+    is which part of a person."""
     header: bool = False
     """For a robot's .csv: a first row with the names of the columns."""
     smpl_model: options.MaybeFile = None

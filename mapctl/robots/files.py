@@ -54,16 +54,17 @@ def build_rows(motion: RobotMotion) -> Float[Tensor, "frames columns"]:
 
 
 def _collect_arrays(motion: RobotMotion) -> dict[str, np.ndarray]:
-    fps, (at, world) = float(motion.fps), motion.chain_links()
+    fps, bodies = float(motion.fps), motion.robot.bodies
+    at, world = (values[:, bodies] for values in motion.chain_links())
     steps = rotations.to_rotation_vector(rotations.from_matrix(world[1:] @ world[:-1].mT))
-    quats = rotations.make_sign_continuous(rotations.from_matrix(world @ motion.robot.zero))
+    quats = rotations.make_sign_continuous(rotations.from_matrix(world @ motion.robot.zero[bodies]))
     spinning = torch.cat([steps, steps[-1:]]) if len(steps) else torch.zeros_like(at)
     return {
         "fps": np.array([fps]),
         "joint_names": np.array(motion.robot.joints),
         "joint_pos": motion.angles.numpy(),
         "joint_vel": _differentiate(motion.angles, fps).numpy(),
-        "body_names": np.array(motion.robot.skeleton.names),
+        "body_names": np.array([motion.robot.skeleton.names[body] for body in bodies]),
         "body_pos_w": at.numpy(),
         "body_quat_w": quats.roll(1, dims=-1).numpy(),
         "body_lin_vel_w": _differentiate(at, fps).numpy(),

@@ -25,25 +25,15 @@ from mapctl import kinematics, rotations
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.formats import toml
 from mapctl.formats.text import one_line
-from mapctl.joint_names import Part, Role, Side, classify_joint
+from mapctl.mesh.primitives import unit
 from mapctl.retarget import RigMap, identify_rig
 from mapctl.retarget.character import RiggedCharacter, Stance
 from mapctl.retarget.joint_matching import REQUIRED
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import Skeleton
 
-_LIMB_PARTS = {
-    Part.HIPS: "UpperLeg",
-    Part.UPPER_LEG: "UpperLeg",
-    Part.LOWER_LEG: "LowerLeg",
-    Part.FOOT: "Foot",
-    Part.SHOULDER: "UpperArm",
-    Part.UPPER_ARM: "UpperArm",
-    Part.LOWER_ARM: "LowerArm",
-    Part.HAND: "Hand",
-}
-"""Canonical joints of a side by what the names of links say: hips of a side are thighs, and shoulders upper arms."""
-_BALLS = ("UpperLeg", "UpperArm")  # joints whose hinges about meet in a point
+_ASIDE, _ACROSS = 0.01, 0.7  # metres that the end of a limb is aside, cosine of an axis across the body
+_HEAD_SHARE = 0.26  # of the shoulders' height over the hips, by which a head is over them, as the canonical body's
 
 
 @dataclass(frozen=True)
@@ -53,7 +43,7 @@ class _Stated:
     __pydantic_config__ = toml.STRICT
 
     links: Mapping[str, str] = field(default_factory=dict)
-    """Link by canonical joint, where names do not show it."""
+    """Link by canonical joint, where another one would be recognised."""
     speed: Annotated[float, Gt(0)] | None = None
     """Largest speed of all joints, rad/s."""
     soles: Mapping[str, Sequence[Sequence[float]]] = field(default_factory=dict)
@@ -109,6 +99,11 @@ class Robot:
         """The link of each corner of the soles."""
         feet = (self.rigmap.joints[f"{side}Foot"] for side in ("left", "right"))
         return [foot for foot, sole in zip(feet, self.soles, strict=True) for _ in sole]
+
+    @property
+    def bodies(self) -> list[int]:
+        """The links that are bodies of the model."""
+        return [link for link, name in enumerate(self.skeleton.names) if not name.startswith("(")]
 
     def find_link(self, joint: str) -> int | None:
         """Find the link that is a canonical joint, None if there is none."""
@@ -200,6 +195,8 @@ class _Tree:
             for joint in own[:-1]:
                 above = self._add(model.joint(joint).name, above, body, joint)
             self.link_of[body] = self._add(model.body(body).name or f"body{body}", above, body, *own[-1:])
+        if not self.names:
+            raise FileFormatError(path, "has no bodies")
 
     def _add(self, name: str, above: int, body: int, joint: int | None = None) -> int:
         self.names.append(name)
@@ -271,35 +268,82 @@ class _Tree:
         return link
 
     def _match_links(self) -> dict[str, str]:
-        """Match links with canonical joints by the words of their names: of a part the last that turns; of hips and
-        shoulders that which is nearest to the point where their axes meet."""
-        roles = [classify_joint(name) for name in self.names]
-        every = range(len(self.names))
-        trunk = [link for link in every if roles[link] == Role(Side.MIDDLE, Part.TORSO)]
-        trunk = [link for link in trunk if link in self.hinges] or trunk
-        found = {"hips": 0} | ({"spine": trunk[0], "chest": trunk[-1]} if trunk else {})
-        if len(trunk) == 1:
-            del found["chest"]
-        heads = [link for link in every if roles[link] == Role(Side.MIDDLE, Part.HEAD)]
-        if heads:
-            found["head"] = max(heads, key=lambda link: self.origins[link][2])
-        groups: dict[str, list[int]] = defaultdict(list)
-        for link, role in enumerate(roles):
-            if role.side is not Side.MIDDLE and role.part in _LIMB_PARTS:
-                groups[role.side.value + _LIMB_PARTS[role.part]].append(link)
-        for joint, named in groups.items():
-            links = [link for link in named if link in self.hinges] or named  # a hand may be fixed to its forearm
-            balls = joint.endswith(_BALLS) and len(links) > 1
-            found[joint] = min(links, key=self._measure_from_axes(links)) if balls else links[-1]
+        """Match links with canonical joints by how the robot is built, upright, facing X, where all angles are zero. A
+        limb is a chain of hinges after a branching; the lowest one of a side is its leg, the longest other its arm. A
+        knee is the second hinge across a leg, an elbow the hinge across an arm that is farthest from both its ends."""
+        below: dict[int, list[int]] = defaultdict(list)
+        for link in self.hinges:
+            below[self._find_moving(self.parents[link])].append(link)
+        chains: list[list[int]] = []
+        for first in (link for parent, links in below.items() if len(links) > 1 or parent == 0 for link in links):
+            chains.append([first])
+            while len(following := below.get(chains[-1][-1], [])) == 1:
+                chains[-1] += following
+        at, found = self.origins, {"hips": 0}
+        arms = list[list[int]]()
+        for side, sign in (("left", 1.0), ("right", -1.0)):
+            own = [chain for chain in chains if len(chain) > 2 and sign * at[chain[-1]][1] > _ASIDE]
+            own.sort(key=lambda chain: at[chain[-1]][2])
+            across = [link for link in own[0] if abs(self._axis(link)[1]) > _ACROSS] if len(own) > 1 else []
+            if len(across) < 2:
+                continue
+            leg, arm, knee = own[0], max(own[1:], key=len), across[1]
+            shoulder, hand = at[arm[1]], self._find_end(arm[-1])
+            bends = [link for link in arm[2:] if abs(unit(at[link] - shoulder) @ self._axis(link)) < _ACROSS]
+            near = {link: min(np.linalg.norm(at[link] - end) for end in (shoulder, at[hand])) for link in bends}
+            elbow = max(near or arm[-1:], key=lambda link: float(near.get(link, 0.0)))
+            found |= {
+                f"{side}UpperLeg": self._find_centre(leg[: leg.index(knee)]),
+                f"{side}LowerLeg": knee,
+                f"{side}Foot": leg[-1],
+                f"{side}UpperArm": self._find_centre(arm[: arm.index(elbow)]),
+                f"{side}LowerArm": elbow,
+            }
+            hand = hand if arm[-1] == elbow else arm[-1]
+            found |= {f"{side}Hand": hand} if hand != elbow else {}
+            arms.append(arm)
+        if len(arms) == 2:
+            found |= self._find_trunk(arms, chains)
         return {joint: self.names[link] for joint, link in found.items()}
 
-    def _measure_from_axes(self, links: list[int]) -> Any:
-        """Return the distance of a link from the point that is nearest to the axes of some, by least squares."""
-        axes = self.data.xaxis[[self.turning[self.hinges.index(link)] for link in links]]
+    def _find_trunk(self, arms: list[list[int]], chains: list[list[int]]) -> dict[str, int]:
+        """Find spine, chest and head; where nothing turns them they are fixed, between hips and shoulders and above."""
+        trunk, link = [], self._find_moving(self.parents[arms[0][0]])
+        while link in self.hinges:
+            trunk, link = [link, *trunk], self._find_moving(self.parents[link])
+        top = trunk[-1] if trunk else 0
+        shoulders = (self.origins[arms[0][0]] + self.origins[arms[1][0]]) / 2
+        found = {"spine": trunk[0] if trunk else self._add_fixed("(spine)", 0, self.origins[0])}
+        if len(trunk) > 1:
+            found["chest"] = top
+        necks = [chain for chain in chains if self.origins[chain[0]][2] > shoulders[2] and chain not in arms]
+        above = _HEAD_SHARE * (shoulders - self.origins[0]) * np.array([0.0, 0.0, 1.0])
+        head = max(necks, key=len)[-1] if necks else self._add_fixed("(head)", top, shoulders + above)
+        return found | {"head": head}
+
+    def _add_fixed(self, name: str, above: int, at: Float[np.ndarray, "3"]) -> int:
+        """Add a link that is no body of the model; parentheses mark its name."""
+        self.names.append(name)
+        self.parents.append(above)
+        self.origins.append(np.array(at))
+        self.zero.append(np.eye(3))
+        return len(self.names) - 1
+
+    def _find_end(self, link: int) -> int:
+        """Find the farthest of the links that are fixed to a link: itself if there is none."""
+        fixed = [own for own in range(len(self.names)) if self._find_moving(own) == link]
+        return max(fixed, key=lambda own: float(np.linalg.norm(self.origins[own] - self.origins[link])))
+
+    def _axis(self, link: int) -> Float[np.ndarray, "3"]:
+        return self.data.xaxis[self.turning[self.hinges.index(link)]]
+
+    def _find_centre(self, links: list[int]) -> int:
+        """Find the link that is nearest to the point where the axes of several about meet, by least squares."""
+        axes = np.stack([self._axis(link) for link in links])
         across = np.eye(3) - axes[:, :, None] * axes[:, None]
         at = np.stack([self.origins[link] for link in links])
         centre = np.linalg.lstsq(across.sum(axis=0), (across @ at[..., None]).sum(axis=0)[:, 0], rcond=None)[0]
-        return lambda link: float(np.linalg.norm(self.origins[link] - centre))
+        return links[int(np.linalg.norm(at - centre, axis=1).argmin())]
 
 
 def _read_speeds(path: Path) -> dict[str, float]:

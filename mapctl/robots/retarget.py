@@ -164,7 +164,7 @@ def _observe_joints(
         part = name.removeprefix("left").removeprefix("right")
         errors = [table.get(part, math.inf) for table in (_POSITION_ERRORS, _ORIENTATION_ERRORS)]
         link = robot.find_link(name)
-        if link is None or errors == [math.inf, math.inf] or (name == "head" and not _turns(robot, "chest", link)):
+        if link is None or errors == [math.inf, math.inf] or (name == "head" and not _turns(robot, link)):
             continue
         weight, turn_weight = (torch.full((frames,), error**-2, dtype=torch.float64) for error in errors)
 
@@ -187,10 +187,10 @@ def _observe_joints(
         yield link, origin, at[:, joint] + moved, weight, orientation, turn_weight, None
 
 
-def _turns(robot: Robot, below: str, link: int) -> bool:
-    """Return whether a joint turns a link that does not turn the one that is a canonical joint."""
-    other = robot.find_link(below)
-    return bool((robot.above[link] & ~robot.above[0 if other is None else other]).any())
+def _turns(robot: Robot, head: int) -> bool:
+    """Return whether a joint turns the head that does not turn the trunk."""
+    trunk = robot.find_link("chest") or robot.find_link("spine") or 0
+    return bool((robot.above[head] & ~robot.above[trunk]).any())
 
 
 @dataclass(frozen=True, eq=False)

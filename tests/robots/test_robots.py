@@ -75,8 +75,8 @@ def test_links_are_where_mujoco_has_them(robot):
         data.qpos[3:7] = rotations.from_matrix(pose.orientation[frame]).roll(1)
         data.qpos[7:] = pose.angles[frame]
         mujoco.mj_kinematics(robot.model, data)
-        for link, name in enumerate(robot.skeleton.names):
-            body = data.body(name)
+        for link in robot.bodies:
+            body = data.body(robot.skeleton.names[link])
             np.testing.assert_allclose(at[frame, link], body.xpos, atol=1e-9)
             np.testing.assert_allclose(world[frame, link] @ robot.zero[link], body.xmat.reshape(3, 3), atol=1e-9)
 
@@ -150,35 +150,22 @@ def test_windows_join_without_a_seam(robot, monkeypatch):
     monkeypatch.setattr(solver, "_WINDOW", 70)
     parts = retarget_to_robot(walk(150), robot)[0]
     assert parts.angles.shape == whole.angles.shape
-    assert float((parts.angles - whole.angles).abs().max()) < 0.05
+    assert float((parts.angles - whole.angles).abs().max()) < 0.1
     assert float(parts.angles.diff(n=2, dim=0).abs().max()) < 1.3 * float(whole.angles.diff(n=2, dim=0).abs().max())
 
 
-def test_names_that_do_not_show_a_part_are_given_in_a_table(folder):
-    words = ("hip", "knee", "ankle", "waist", "shoulder", "elbow", "head", "palm")
-
-    def hide(name):
-        for number, word in enumerate(words):
-            name = name.replace(word, f"j{number}")
-        return name
-
-    path = make_mjcf(folder / "strange.xml", rename=hide)
-    with pytest.raises(FileFormatError, match=r"no link is known to be \w+; name it under \[links\] in strange\.toml"):
+def test_links_are_matched_whatever_their_names_and_a_table_overrules(folder):
+    numbers = {}
+    path = make_mjcf(folder / "strange.xml", rename=lambda name: f"part{numbers.setdefault(name, len(numbers))}")
+    plain = model.load(make_mjcf(folder / "plain.xml")).rigmap.joint_names
+    found = model.load(path).rigmap.joint_names
+    for joint, link in plain.items():
+        name = link.removesuffix("_link")
+        assert found[joint] == (link.replace(name, f"part{numbers[name]}") if name in numbers else link)
+    knee = found["leftLowerLeg"]
+    path.with_suffix(".toml").write_text(f'[links]\nleftFoot = "{knee}"\n')
+    with pytest.raises(FileFormatError, match="has no shape; give the corners"):
         model.load(path)
-    parts = {
-        "UpperLeg": "hip_roll",
-        "LowerLeg": "knee",
-        "Foot": "ankle_roll",
-        "UpperArm": "shoulder_roll",
-        "LowerArm": "elbow",
-    }
-    rows = [
-        f'{side}{part} = "{hide(f"{side}_{link}")}_link"' for side in ("left", "right") for part, link in parts.items()
-    ]
-    path.with_suffix(".toml").write_text(
-        "\n".join(["[links]", 'hips = "pelvis"', f'spine = "{hide("waist_yaw")}_link"', *rows])
-    )
-    assert model.load(path).rigmap.joint_names["leftFoot"] == "left_j2_roll_link"
     path.with_suffix(".toml").write_text("speeds = 3\n")
     with pytest.raises(FileFormatError, match="allowed: links, speed, soles"):
         model.load(path)
