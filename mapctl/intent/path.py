@@ -2,6 +2,7 @@
 
 import bisect
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
 
@@ -183,11 +184,32 @@ _BRAKING = 0.9  # m/s^2, before a corner and after it
 def walk_at_ease(curve: Curve) -> SpeedProfile:
     """Return the speeds of a walk for which none is given: USUAL_SPEED, and lower before and in corners that turn
     faster than walking people do."""
-    arcs = torch.linspace(0, curve.length, max(2, round(curve.length / _STEP) + 1), dtype=torch.float64)
-    limit = _limit_speeds(curve, arcs)
+    limit = _limit_speeds(curve, _sample_arcs(curve))
     if bool((limit >= USUAL_SPEED).all()):
         return SpeedProfile.constant(USUAL_SPEED)
-    speeds, step = limit.clamp(max=USUAL_SPEED).tolist(), float(arcs[1])
+    return _brake_before(curve, limit.clamp(max=USUAL_SPEED))
+
+
+def limit_speeds(profile: SpeedProfile, curve: Curve, limits: Sequence[tuple[float, float, float]]) -> SpeedProfile:
+    """Lower the speeds of a profile between arcs, metres, to a speed at most, m/s, (start, stop, speed) each; one
+    brakes before them as before corners."""
+    if not limits:
+        return profile
+    arcs = _sample_arcs(curve)
+    speeds = torch.tensor([profile.at(arc) for arc in arcs.tolist()], dtype=torch.float64)
+    for start, stop, speed in limits:
+        speeds = torch.where((arcs >= start) & (arcs <= stop), speeds.clamp(max=speed), speeds)
+    return _brake_before(curve, speeds)
+
+
+def _sample_arcs(curve: Curve) -> Float[Tensor, " arcs"]:
+    return torch.linspace(0, curve.length, max(2, round(curve.length / _STEP) + 1), dtype=torch.float64)
+
+
+def _brake_before(curve: Curve, limit: Float[Tensor, " arcs"]) -> SpeedProfile:
+    """Lower speeds, m/s, at arcs as sampled, so that none rises or falls faster than one brakes."""
+    arcs, speeds = _sample_arcs(curve), limit.tolist()
+    step = float(arcs[1])
     for _ in range(2 if curve.closed else 1):  # what is before a loop's first corner is its end
         braked = _limit_rise(speeds[::-1], step)[::-1]
         speeds = _limit_rise(braked, step)

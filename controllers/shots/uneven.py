@@ -1,0 +1,413 @@
+"""Motions found on a flat floor, put onto uneven ground.
+
+Each contact's foothold moves along the direction of travel by as little as the whole foot needs to stand on one plane,
+as a tread or a ramp: dynamic programming over all contacts, so that steps stay even. A swing foot takes the shortest
+curve over what is between two footholds, and is lifted where it would come too near. Hips follow the mean of what both
+feet stand on, and legs reach by inverse kinematics. On a flat floor nothing changes.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+import torch
+from jaxtyping import Bool, Float
+from numpy import ndarray
+from torch import Tensor
+
+from controllers.shots.footsteps import Footstep, bend_legs, find_ankles
+from mapctl import contacts, kinematics, rotations
+from mapctl.curves import Curve
+from mapctl.features import PRIOR_FPS
+from mapctl.ground import Ground
+from mapctl.intent.path import SpeedProfile, limit_speeds
+from mapctl.motion import Motion
+from mapctl.numerics import gaussian
+from mapctl.numerics.easing import smootherstep
+from mapctl.numerics.intervals import true_intervals
+from mapctl.numerics.smooth_offsets import smooth_between
+from mapctl.retarget.carry import lower_hips
+from mapctl.retarget.character import LEGS, limb_extension
+from mapctl.skeleton import CANONICAL, FEET, TOES, find_heels
+
+STEEPEST = math.radians(15.0)
+"""Slope up to which feet are put onto ground as on a flat floor, radians."""
+HIGHEST = 0.20
+"""Height of a step up to which they are, metres."""
+CLEARANCE = 0.03
+"""Metres that a swing foot keeps over edges."""
+EDGE = 0.03
+"""Rise of the ground within 2 cm, metres, that is an edge."""
+_STEP_SECONDS = 0.5  # of a step of slow walks, whatever its length: `mapctl follow line:8 --speed 0.6` to 0.9
+_DEEPEST = 0.6  # metres of a tread that is taken in one step
+_BEFORE = 0.6  # metres before stairs, and after them, that are walked as slowly
+_EDGE_HEIGHT = 0.05  # metres of an edge of stairs
+_MARGIN, _HALF_WIDTH = 0.02, 0.04  # metres between a sole's ends and an edge, and of half a sole
+_FARTHEST, _GRID = 0.4, 0.01  # metres that a foothold is moved by at most, and between those that are tried
+_MOVED, _UNEVEN, _TOO_HIGH = 0.1, 0.004, 0.01  # metres that cost the same: moved, of a sole's rest, over HIGHEST
+_HIPS_SECONDS, _HEADING_SECONDS = 0.15, 0.3  # over which hips follow the feet, and the direction of travel is the mean
+_BENDS_HERTZ = 4.0  # of a swing's trajectory
+_LIFT_ACCELERATION = 20.0  # m/s^2 with which a foot is lifted further at most
+
+
+class Sole(NamedTuple):
+    """Points of a foot's sole, from its toe joint, in the frame of the foot joint, metres."""
+
+    heel: Float[Tensor, "3"]
+    ball: Float[Tensor, "3"]
+    """Under the toe joint."""
+    tip: Float[Tensor, "3"]
+    """Tip of straight toes."""
+
+    @staticmethod
+    def of(motion: Motion, rest_height: float, foot: int) -> "Sole":
+        """Return the sole of a foot whose toe joint rests at a height over the floor, metres."""
+        level = torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64)
+        ball = level.new_tensor([0.0, -rest_height, 0.0])
+        back = (find_heels(motion.skeleton)[foot] - motion.skeleton.offsets[CANONICAL.index(TOES[foot])]) * level
+        toes = level.new_tensor(motion.skeleton.end_offsets.get(TOES[foot], (0.0, 0.0, 0.0))) * level
+        return Sole(ball + back, ball, ball - torch.nn.functional.normalize(back, dim=0) * toes.norm())
+
+    def points(
+        self, toes: Float[Tensor, "frames 3"], turns: Float[Tensor, "frames 4"], up: Float[Tensor, "frames 4"]
+    ) -> Float[Tensor, "frames 3 3"]:
+        """Return the points of a foot, world, metres, from its toe joint and rotation: toes stay level on the slope
+        (the rotation `up`) while the heel is raised."""
+        heel, ball, straight = (rotations.rotate(turns, point.expand_as(toes)) for point in self)
+        own = rotations.rotate(rotations.inverse(up), straight - ball)
+        level = own * own.new_tensor([1.0, 0.0, 1.0])
+        level = torch.nn.functional.normalize(level, dim=-1) * own.norm(dim=-1, keepdim=True)
+        low = rotations.rotate(up, toes.new_tensor([0.0, self.ball[1], 0.0]).expand_as(toes)) + rotations.rotate(up, level)
+        return toes[:, None] + torch.stack([heel, ball, torch.where(own[:, 1:2] < 0, low, straight)], dim=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Foothold:
+    """A contact of a foot, and the plane that it stands on."""
+
+    foot: int
+    """0 is left, 1 is right."""
+    start: int
+    """First frame."""
+    stop: int
+    """One past the last frame."""
+    toe: Float[Tensor, "2"]
+    """Toe joint over the flat floor, x and z, metres."""
+    moved: Float[Tensor, "2"] = torch.zeros(2, dtype=torch.float64)
+    """By how much it is moved, metres."""
+    height: float = 0.0
+    """Height of the plane below the toe joint, metres."""
+    gradient: Float[Tensor, "2"] = torch.zeros(2, dtype=torch.float64)
+    """Rise of the plane along x and along z."""
+    over_edge: float = 0.0
+    """Height by which the ground under the sole differs from one plane, metres."""
+
+    @property
+    def up(self) -> Float[Tensor, "4"]:
+        """Rotation from the floor to the plane."""
+        x, z = self.gradient
+        upright = self.gradient.new_tensor([0.0, 1.0, 0.0])
+        return rotations.between_vectors(upright, torch.stack([-x, torch.ones_like(x), -z]))
+
+
+@dataclass(frozen=True)
+class Footing:
+    """How feet stand and swing on uneven ground; metres."""
+
+    clearance: float
+    """Lowest height of a swing foot over an edge that it passes; infinite where it passes none."""
+    penetration: float
+    """Deepest point of a sole in the ground, beyond that over the flat floor."""
+    over_edge: int
+    """Feet that stand over an edge."""
+    steepest: float
+    """Steepest slope that a foot stands on, radians."""
+    highest: float
+    """Highest step from one foothold to the next."""
+
+    @property
+    def text(self) -> str:
+        """One line."""
+        over = f"{100 * self.clearance:.1f} cm over edges" if self.clearance < math.inf else "no edge"
+        return f"swing {over}, penetration {100 * self.penetration:.1f} cm, {self.over_edge} feet over an edge"
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences about what the density, which is of flat floors, does not know."""
+        found = []
+        if self.steepest > STEEPEST + 1e-6:
+            found.append(
+                f"the ground slopes by {math.degrees(self.steepest):.0f} degrees where a foot stands: people walk"
+                f" otherwise from {math.degrees(STEEPEST):.0f} on, and the prior knows flat floors"
+            )
+        if self.highest > HIGHEST + 1e-6:
+            found.append(
+                f"a step is {100 * self.highest:.0f} cm high: people climb otherwise from {100 * HIGHEST:.0f} cm on, and"
+                " the prior knows flat floors"
+            )
+        if self.over_edge:
+            found.append(f"{self.over_edge} feet stand over an edge: no foothold near enough has room for a sole")
+        return tuple(found)
+
+
+def slow_on_stairs(profile: SpeedProfile, curve: Curve, ground: Ground, slowest: float) -> SpeedProfile:
+    """Lower speeds, m/s, where a path has edges less than a step apart, so that a step is one tread long; to `slowest`
+    at most, m/s."""
+    arcs = torch.linspace(0, curve.length, max(2, round(curve.length / _GRID) + 1), dtype=torch.float64)
+    heights = ground.height(curve.ground_point(arcs))
+    edges = [float(arcs[start]) for _, start, _ in true_intervals((heights.diff().abs() > _EDGE_HEIGHT)[:, None])]
+    treads = [(one, other) for one, other in pairwise(edges) if other - one < _DEEPEST]
+    limits = [(one - _BEFORE, other + _BEFORE, max(slowest, (other - one) / _STEP_SECONDS)) for one, other in treads]
+    return limit_speeds(profile, curve, limits)
+
+
+def step_onto_ground(motion: Motion, ground: Ground, rest_height: float) -> tuple[Motion, Footing, list[Footstep]]:
+    """Put a motion on the flat floor, canonical joints at PRIOR_FPS with toe joints resting at a height (metres), onto
+    the ground; also return how its feet stand there, and its footsteps."""
+    soles = [Sole.of(motion, rest_height, foot) for foot in range(2)]
+    holds = _choose_footholds(_find_footholds(motion), motion, ground, soles)
+    flat, turned = motion.joint_positions().double(), motion.joint_rotations().double()
+    toes, turns, tracks = [], [], list[_FootTrack]()
+    for foot, sole in enumerate(soles):
+        own, turn = [hold for hold in holds if hold.foot == foot], turned[:, CANONICAL.index(FEET[foot])]
+        tracks.append(_FootTrack.of(own, flat[:, CANONICAL.index(TOES[foot])], ground, sole))
+        turns.append(rotations.multiply(tracks[-1].up, turn))
+        toes.append(tracks[-1].lift(turns[-1], turn, ground, sole))
+    sigma, root, turns = _HIPS_SECONDS * PRIOR_FPS, motion.root_position.double().clone(), torch.stack(turns, dim=1)
+    root[:, ::2] += gaussian.smooth(torch.stack([track.moved for track in tracks]).mean(dim=0), sigma)
+    root[:, 1] += gaussian.smooth(torch.stack([track.height for track in tracks]).mean(dim=0), sigma)
+    ankles = find_ankles(motion.skeleton, torch.stack(toes, dim=1), turns)
+    lowered = lower_hips(replace(motion, root_position=root), ankles, limb_extension(motion, LEGS))
+    done = bend_legs(lowered, ankles, turns)
+    done = replace(done, local_quat_xyzw=rotations.make_sign_continuous(done.local_quat_xyzw))
+    steps = [
+        Footstep(one.foot, one.stop - 1, other.start, toe=tuple((other.toe + other.moved).tolist()))
+        for foot in range(2)
+        for one, other in pairwise([hold for hold in holds if hold.foot == foot])
+    ]
+    footing = _measure(done, motion, holds, ground, soles, tracks)
+    return done, footing, sorted(steps, key=lambda step: step.land)
+
+
+def _find_footholds(motion: Motion) -> list[Foothold]:
+    """Find the contacts of a motion in the order of their beginnings; its first and its last frame are some."""
+    toes = motion.joint_positions()[:, list(CANONICAL.indices(TOES))].double()
+    planted = contacts.debounced(contacts.detect_contacts(toes, motion.fps))
+    planted[[0, -1]] = True
+    found = [
+        Foothold(foot, start, stop, toes[start:stop, foot, ::2].median(dim=0).values)
+        for foot, start, stop in true_intervals(planted)
+    ]
+    return sorted(found, key=lambda hold: hold.start)
+
+
+def _choose_footholds(holds: Sequence[Foothold], motion: Motion, ground: Ground, soles: Sequence[Sole]) -> list[Foothold]:
+    """Move footholds along the direction of travel: the least sum of squares of how far each is moved, how much farther
+    than the one before, how uneven the ground under its sole is, and how much too high it is (Viterbi 1967)."""
+    hips = kinematics.heading(motion.local_quat_xyzw[:, 0].double())
+    ahead = torch.stack([torch.sin(hips), torch.cos(hips)], dim=-1)
+    ahead = torch.nn.functional.normalize(gaussian.smooth(ahead, _HEADING_SECONDS * PRIOR_FPS), dim=-1)
+    offsets = torch.arange(-_FARTHEST, _FARTHEST + _GRID / 2, _GRID, dtype=torch.float64)
+    feet, found = motion.joint_rotations().double(), []
+    for hold in holds:
+        middle = (hold.start + hold.stop) // 2
+        yaw = rotations.split_heading(feet[middle, CANONICAL.index(FEET[hold.foot])])[0]
+        moved = offsets[:, None] * ahead[middle]
+        found.append((moved, *_fit_planes(hold.toe + moved, yaw, ground, soles[hold.foot])))
+    cost, came = torch.zeros_like(offsets), []
+    between = ((offsets[:, None] - offsets) / _MOVED).square()
+    for number, (_, heights, _, uneven) in enumerate(found):
+        if number:
+            rise = (heights - found[number - 1][1][:, None]).abs() - HIGHEST
+            cost, back = (cost[:, None] + between + (rise.clamp_min(0) / _TOO_HIGH).square()).min(dim=0)
+            came.append(back)
+        cost = cost + (offsets / _MOVED).square() + (uneven / _UNEVEN).square()
+    at, chosen = int(cost.argmin()), []
+    for number in range(len(holds) - 1, -1, -1):
+        moved, heights, gradients, uneven = (values[at] for values in found[number])
+        chosen.append(
+            replace(
+                holds[number], moved=moved, height=float(heights), gradient=gradients, over_edge=float(uneven)
+            )
+        )
+        at = int(came[number - 1][at]) if number else at
+    return chosen[::-1]
+
+
+def _fit_planes(
+    toes: Float[Tensor, "n 2"], yaw: Tensor, ground: Ground, sole: Sole
+) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 2"], Float[Tensor, " n"]]:
+    """Fit planes to the ground under soles with toe joints at points (x, z): heights below these, gradients along x and
+    z, and by how much the ground differs from the planes, metres."""
+    back, front = (float((end - sole.ball)[::2].norm()) + _MARGIN for end in (sole.heel, sole.tip))
+    along = torch.tensor([-back, 0.5 * (front - back), front], dtype=torch.float64)
+    aside = torch.tensor([-_HALF_WIDTH, 0.0, _HALF_WIDTH], dtype=torch.float64)
+    under = rotations.rotate_ground(torch.cartesian_prod(aside, along), yaw)
+    heights = ground.height(toes[:, None] + under)
+    axes = torch.cat([torch.ones_like(under[:, :1]), under], dim=-1)
+    planes = heights @ torch.linalg.pinv(axes).T
+    off = (heights - planes @ axes.T).abs().amax(dim=-1)
+    level = off > EDGE / 2  # over an edge the foot stands on what is higher
+    height = torch.where(level, heights.amax(dim=-1), planes[:, 0])
+    return height, torch.where(level[:, None], 0.0, planes[:, 1:]), off
+
+
+@dataclass(frozen=True, eq=False)
+class _FootTrack:
+    """What is added to a foot's motion over the flat floor, by frame."""
+
+    base: Float[Tensor, "frames 3"]
+    """Point below the toe joint on the ground or on the way over it, world, metres."""
+    up: Float[Tensor, "frames 4"]
+    """Rotation from the floor to the slope."""
+    moved: Float[Tensor, "frames 2"]
+    """By how much the foot is moved along the ground, evenly from foothold to foothold, metres."""
+    height: Float[Tensor, " frames"]
+    """Height of its footholds, evenly from one to the next, metres."""
+    rest: Float[Tensor, " frames"]
+    """Height of the toe joint over the flat floor, metres."""
+    swings: Sequence[tuple[int, int]]
+    """Frames start to stop of its swings."""
+    standing: Bool[Tensor, " frames"]
+    """Whether it stands."""
+
+    @staticmethod
+    def of(holds: Sequence[Foothold], toe: Float[Tensor, "frames 3"], ground: Ground, sole: Sole) -> "_FootTrack":
+        frames, flat = len(toe), toe[:, ::2]
+        moved, height, up, bent = (toe.new_zeros(frames, width) for width in (2, 1, 4, 3))
+        for hold in holds:
+            held = slice(hold.start, hold.stop)
+            moved[held], up[held] = hold.moved, hold.up
+            height[held, 0] = hold.height + (flat[held] - hold.toe) @ hold.gradient
+        swings = [(one.stop, other.start) for one, other in pairwise(holds)]
+        for one, other in pairwise(holds):
+            swing = slice(one.stop, other.start)
+            away, clock = other.toe - one.toe, torch.arange(one.stop, other.start)
+            if float(away.norm()) > _MOVED:
+                share = ((flat[swing] - one.toe) @ away / away.square().sum()).clamp(0, 1)
+            else:
+                share = smootherstep((clock - one.stop + 1) / (other.start - one.stop + 1)).to(toe)
+            moved[swing] = torch.lerp(one.moved, other.moved, share[:, None])
+            height[swing, 0] = one.height + (other.height - one.height) * share
+            up[swing] = rotations.slerp(one.up.expand(len(share), 4), other.up.expand(len(share), 4), share)
+            bent[swing] = _stretch_over(one, other, share, ground, sole)
+        standing = torch.ones(frames, dtype=torch.bool)
+        for start, stop in swings:
+            standing[start:stop] = False
+        bent = smooth_between(bent, standing, hertz=_BENDS_HERTZ, fps=PRIOR_FPS)
+        base = bent.clone()
+        base[:, ::2] += flat + moved
+        base[:, 1] += height[:, 0]
+        return _FootTrack(base, up, moved, height[:, 0], toe[:, 1], swings, standing)
+
+    def lift(
+        self, turns: Float[Tensor, "frames 4"], flat_turns: Float[Tensor, "frames 4"], ground: Ground, sole: Sole
+    ) -> Float[Tensor, "frames 3"]:
+        """Return the toe joint, lifted in its swings where the sole would come too near to the ground."""
+        level, upright = torch.zeros_like(self.up), torch.zeros_like(self.base)
+        level[:, 3], upright[:, 1] = 1.0, self.rest
+        toe = self.base + rotations.rotate(self.up, upright)
+        flat, points = sole.points(upright, flat_turns, level), sole.points(toe, turns, self.up)
+        need = (_find_required(points, flat[..., 1], ground) - points[..., 1]).amax(dim=-1)
+        for start, stop in self.swings:
+            toe[start:stop, 1] += _lift_smoothly(need[start:stop])
+        return toe
+
+
+def _stretch_over(
+    one: Foothold, other: Foothold, share: Float[Tensor, " frames"], ground: Ground, sole: Sole
+) -> Float[Tensor, "frames 3"]:
+    """Return how far the shortest curve from one foothold to another over the ground between them is from the straight
+    line, metres, at shares of its length. The ground is as high as its highest point under the sole."""
+    begin, end = one.toe + one.moved, other.toe + other.moved
+    length = float((end - begin).norm())
+    if length < _MOVED:
+        return torch.zeros(len(share), 3, dtype=torch.float64)
+    ahead = (end - begin) / length
+    at = torch.linspace(0, length, max(3, round(length / _GRID)), dtype=torch.float64)
+    under = torch.linspace(float(sole.heel[2]) - _MARGIN, float(sole.tip[2]) + _MARGIN, 12, dtype=torch.float64)
+    slopes = torch.lerp(one.gradient @ ahead, other.gradient @ ahead, at / length)
+    points = begin + (at[:, None] + under)[..., None] * ahead
+    over = (ground.height(points) - slopes[:, None] * under).amax(dim=-1)
+    straight = torch.lerp(over.new_tensor(one.height), over.new_tensor(other.height), at / length)
+    over += torch.where(over > straight + EDGE / 2, CLEARANCE, 0.0)
+    over[0], over[-1] = one.height, other.height
+    knots = _find_hull(at.numpy(), over.numpy())
+    along, high = at[knots].numpy(), over[knots].numpy()
+    arcs = np.concatenate([[0.0], np.hypot(np.diff(along), np.diff(high)).cumsum()])
+    forward, up = (share.new_tensor(np.interp(share.numpy() * arcs[-1], arcs, axis)) for axis in (along, high))
+    forward, up = forward - share * length, up - torch.lerp(over[0], over[-1], share)
+    return torch.stack([forward * ahead[0], up, forward * ahead[1]], dim=-1)
+
+
+def _find_hull(x: Float[ndarray, " n"], y: Float[ndarray, " n"]) -> list[int]:
+    """Find the points on the least concave curve over all, from the first to the last (Andrew 1979)."""
+    hull = list[int]()
+    for new in range(len(x)):
+        while len(hull) > 1:
+            one, last = hull[-2:]
+            if (x[last] - x[one]) * (y[new] - y[one]) < (y[last] - y[one]) * (x[new] - x[one]):
+                break
+            hull.pop()
+        hull.append(new)
+    return hull
+
+
+def _is_near_edge(points: Float[Tensor, "*batch 3"], ground: Ground) -> tuple[Tensor, Tensor]:
+    """Return whether there is an edge within 1 cm of points, and the highest ground there, metres."""
+    around = torch.cartesian_prod(*[torch.tensor([-0.01, 0.0, 0.01], dtype=torch.float64)] * 2)
+    heights = ground.height(points[..., None, ::2] + around)
+    return heights.amax(dim=-1) - heights.amin(dim=-1) > EDGE, heights.amax(dim=-1)
+
+
+def _find_required(
+    points: Float[Tensor, "frames 3 3"], flat: Float[Tensor, "frames 3"], ground: Ground
+) -> Float[Tensor, "frames 3"]:
+    """Find the least heights of a swing foot's points: as over the flat floor up to the clearance, and all of it over
+    edges."""
+    edge, highest = _is_near_edge(points, ground)
+    required = ground.height(points[..., ::2]) + flat.clamp(max=CLEARANCE)
+    return torch.where(edge, highest + CLEARANCE, required)
+
+
+def _lift_smoothly(need: Float[Tensor, " frames"]) -> Float[Tensor, " frames"]:
+    """Return the smoothest lift, metres, that is as high as needed, from none before and to none after."""
+    frames = len(need)
+    seconds = torch.minimum(torch.arange(1, frames + 1), torch.arange(frames, 0, -1)) / PRIOR_FPS
+    lowest = need.clamp_min(0).minimum(0.5 * _LIFT_ACCELERATION * seconds.square()).numpy()
+    if not lowest.any():
+        return torch.zeros_like(need)
+    bends = np.diff(np.eye(frames + 4), 2, axis=0)[:, 2:-2]
+    found = scipy.optimize.lsq_linear(bends, np.zeros(len(bends)), bounds=(lowest, np.inf))
+    return need.new_tensor(found.x)
+
+
+def _measure(
+    done: Motion, motion: Motion, holds: Sequence[Foothold], ground: Ground, soles: Sequence[Sole], tracks: Sequence[_FootTrack]
+) -> Footing:
+    """Measure how feet stand and swing."""
+    toes, turns = (values.double() for values in (done.joint_positions(), done.joint_rotations()))
+    flat, flat_turns = (values.double() for values in (motion.joint_positions(), motion.joint_rotations()))
+    clearance, depth, level = math.inf, 0.0, torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    for foot, (sole, track) in enumerate(zip(soles, tracks, strict=True)):
+        toe, ankle = CANONICAL.index(TOES[foot]), CANONICAL.index(FEET[foot])
+        points = sole.points(toes[:, toe], turns[:, ankle], track.up)
+        before = sole.points(flat[:, toe], flat_turns[:, ankle], level.expand(len(flat), 4))[..., 1]
+        over = points[..., 1] - ground.height(points[..., ::2])
+        depth = max(depth, float((before.clamp(max=0) - over).max()))
+        edge, highest = _is_near_edge(points, ground)
+        passing = edge & ~track.standing[:, None]
+        if bool(passing.any()):
+            clearance = min(clearance, float((points[..., 1] - highest)[passing].min()))
+    ordered = [hold.height for hold in holds]
+    return Footing(
+        clearance,
+        depth,
+        sum(hold.over_edge > EDGE / 2 for hold in holds),
+        math.atan(max(float(hold.gradient.norm()) for hold in holds)),
+        max((abs(other - one) for one, other in pairwise(ordered)), default=0.0),
+    )
