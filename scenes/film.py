@@ -18,6 +18,7 @@ import torch
 from mapctl import retarget
 from mapctl.errors import RequestError
 from mapctl.formats import atomic
+from mapctl.ground import Ground
 from mapctl.mesh import colours
 from mapctl.mesh.primitives import Array, Surface
 from mapctl.motion import Motion
@@ -192,6 +193,7 @@ def film(
     fps: Fraction | float | None = None,
     renderer: RendererName | None = None,
     props: Sequence[Surface] = (),
+    ground: Ground | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Path]:
     """Film the actors walking together; one pass serves all outputs. Returns the paths written.
@@ -200,13 +202,13 @@ def film(
     be left out. Where stick figures are drawn a character is one of them, and a line is logged on that. `out` is a
     path or several, each ending in .mp4, .gif, .webp or .png (a contact sheet: ghosts along the trajectory over a row
     of stills). Each frame of the motions is one frame of the film unless `fps` resamples them. `size` is the width and
-    height in pixels (MP4 rounds up to even). `props` are what stands around (`scenes.overlays`). `progress` is called
+    height in pixels (MP4 rounds up to even). `props` are what stands around (`scenes.overlays`), `ground` what they walk on if it is not flat. `progress` is called
     with frames done and all frames. `renderer` is that of `scenes.renderers.select_painter`. RequestError for
     endings, sizes and paths that cannot be.
     """
     paths = check_outputs([out] if isinstance(out, str | PathLike) else out, size)
     shots, brush, camera = [Shot(*actor) for actor in actors], select_painter(renderer), camera or CameraSettings()
-    stage = Stage(shots, fps, props)
+    stage = Stage(shots, fps, props, ground)
     if brush.name == STICK_FIGURES and any(shot.drawn is not None for shot in shots):
         _log.warning("stick figures show no mesh: characters are drawn by their bones")
     if moving := [path for path in paths if path.suffix.lower() in WRITERS]:

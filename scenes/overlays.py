@@ -3,10 +3,14 @@
 All are flat surfaces a few millimetres apart; whoever draws them keeps the order of this file.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import scipy
+import torch
 
 from mapctl.curves.obstacles import Obstacle
+from mapctl.ground import Ground
 from mapctl.mesh import colours
 from mapctl.mesh.primitives import Array, Surface, merge_surfaces, unit, unit_sphere
 
@@ -148,6 +152,7 @@ def _triangulate_quads(quads: Array) -> Array:
 
 
 _OBSTACLE_COLOUR = "#b9aa9c"
+_GROUND_COLOUR, _WALL, _FIELD_CELLS = "#cfc8be", 0.72, 160
 _HEIGHT, _SHADE = 0.35, 0.82  # metres of an obstacle's walls, and how dark they are beside its top
 _TARGET_RADIUS, _LOOK_RADIUS, _HIPS_RADIUS = 0.035, 0.05, 0.16  # metres
 
@@ -164,6 +169,43 @@ def build_obstacle(obstacle: Obstacle) -> Surface:
     sides = _make_plain(np.concatenate([low, high]), np.concatenate([walls, walls[:, ::-1]]), _OBSTACLE_COLOUR)
     sides.rgba[:, :3] *= _SHADE
     return merge_surfaces([sides, _make_plain(high, np.concatenate([fan, fan[:, ::-1]]), _OBSTACLE_COLOUR)])
+
+
+def raise_onto(points: Array, ground: Ground | None, times: int = 1) -> Array:
+    """Raise points (..., 3), metres, by the ground's height below them, or lower them by it where `times` is -1."""
+    if ground is None:
+        return points
+    height = ground.height(torch.from_numpy(points[..., [0, 2]])).numpy()
+    return points + times * height[..., None] * np.array([0.0, 1.0, 0.0])
+
+
+def drape(surface: Surface, ground: Ground | None) -> Surface:
+    """Lay a flat surface onto the ground."""
+    return replace(surface, vertices=raise_onto(surface.vertices, ground))
+
+
+def build_ground(ground: Ground) -> Surface:
+    """Build the slabs of a ground, their walls darker than their tops, and its height field."""
+    found = []
+    if ground.image is not None:
+        x, z = (centre + size * np.linspace(-0.5, 0.5, _FIELD_CELLS) for centre, size in zip(ground.image.centre, ground.image.size, strict=True))
+        flat = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1).reshape(-1, 2)
+        vertices = raise_onto(np.insert(flat, 1, 0.0, axis=1), replace(ground, boxes=(), ramps=(), stairs=()))
+        index = np.arange(_FIELD_CELLS**2).reshape(_FIELD_CELLS, _FIELD_CELLS)
+        quads = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]], axis=-1).reshape(-1, 4)
+        field = _make_plain(vertices, _triangulate_quads(quads), _GROUND_COLOUR)
+        slopes = np.stack(np.gradient(vertices[:, 1].reshape(_FIELD_CELLS, -1), x, z), axis=-1).reshape(-1, 2)
+        field.rgba[:, :3] *= np.clip(1 + slopes @ LIGHT[[0, 2]], _WALL, 1)[:, None]
+        found.append(field)
+    for slab in ground.slabs:
+        top = slab.corners()
+        low = top * np.array([1.0, 0.0, 1.0])
+        index, following = np.arange(4), np.roll(np.arange(4), -1)
+        walls = _triangulate_quads(np.stack([index, following, following + 4, index + 4], axis=1))
+        sides = _make_plain(np.concatenate([low, top]), walls, _GROUND_COLOUR)
+        sides.rgba[:, :3] *= _WALL
+        found += [sides, _make_plain(top, np.array([[0, 1, 2], [0, 2, 3]]), _GROUND_COLOUR)]
+    return merge_surfaces(found)
 
 
 def build_target(position: tuple[float, float, float]) -> Surface:

@@ -19,11 +19,12 @@ from typing import Any, Literal
 import numpy as np
 
 from mapctl.errors import MapctlError, RequestError
+from mapctl.ground import Ground
 from mapctl.mesh import colours
 from mapctl.mesh.mannequin import Body
 from mapctl.mesh.primitives import Array, Surface, merge_surfaces, unit
 from scenes.cameras import View
-from scenes.overlays import LIGHT, build_shadow
+from scenes.overlays import LIGHT, build_shadow, drape, raise_onto
 
 STICK_FIGURES = "matplotlib (stick figures)"
 """Name of the painter that works everywhere; its module needs matplotlib."""
@@ -67,6 +68,8 @@ class Content:
     figures: Sequence[Figure]
     veils: Sequence[Figure] = ()
     """Bodies that one sees through (see `blend_veils`); they throw no shadow."""
+    terrain: Ground | None = None
+    """Ground on which the shadows fall where it is not flat."""
 
 
 def blend_veils(plain: Array, covered: Array) -> Array:
@@ -157,7 +160,10 @@ class OffscreenPainter:
     def paint(self, view: View, content: Content) -> Array:
         """Paint the picture, (height, width, 3) uint8."""
         eye = view.pose[:3, 3]
-        shadows = [build_shadow(*f.body.sticks(f.frame)[:2], layer=k) for k, f in enumerate(content.figures)]
+        shadows = [
+            drape(build_shadow(raise_onto(ends, content.terrain, -1), radii, layer=k), content.terrain)
+            for k, (ends, radii, _) in enumerate(f.body.sticks(f.frame) for f in content.figures)
+        ]
         nodes = self._add(list_layers([*content.ground, *shadows], [f.surface() for f in content.figures], eye))
         camera = self._camera.camera
         camera.yfov, camera.aspectRatio = view.fov, view.width / view.height
@@ -267,7 +273,8 @@ class StickPainter:
             _draw_flat(axes, view, surface)
         sticks = [(*figure.body.sticks(figure.frame), figure) for figure in content.figures]
         for ends, radii, _, _ in sticks:  # shadows are the sticks laid on the ground along the light
-            fallen = ends - ends[..., 1:2] * (LIGHT / LIGHT[1])
+            fallen = raise_onto(ends, content.terrain, -1)
+            fallen = raise_onto(fallen - fallen[..., 1:2] * (LIGHT / LIGHT[1]), content.terrain)
             _draw_lines(
                 axes, view, fallen, radii, np.tile([*colours.rgb(colours.SHADOW), _STICK_SHADOW], (len(ends), 1))
             )

@@ -12,6 +12,7 @@ import torch
 from mapctl.contacts import detect_contacts
 from mapctl.curves import Curve
 from mapctl.errors import RequestError
+from mapctl.ground import Ground
 from mapctl.joint_names import Side
 from mapctl.mesh import colours
 from mapctl.mesh.mannequin import Body
@@ -95,26 +96,34 @@ class StagedActor:
 class Stage:
     """All actors and props on their ground. `fps` resamples every motion; by default the first actor's rate holds."""
 
-    def __init__(self, shots: Sequence[Shot], fps: Fraction | float | None = None, props: Sequence[Surface] = ()):
+    def __init__(
+        self,
+        shots: Sequence[Shot],
+        fps: Fraction | float | None = None,
+        props: Sequence[Surface] = (),
+        ground: Ground | None = None,
+    ):
         if not shots:
             raise RequestError("a film needs at least one actor")
         self.fps = Fraction(fps or shots[0].motion.fps).limit_denominator(100_000)
-        self.players = [_prepare_actor(shot, k, len(shots), self.fps) for k, shot in enumerate(shots)]
+        self.players = [_prepare_actor(shot, k, len(shots), self.fps, ground) for k, shot in enumerate(shots)]
         self.num_frames = max(p.start + p.body.num_frames for p in self.players)
         self._veils = [figure for player in self.players for figure in player.poses]
         targets = [player.target for player in self.players if player.target is not None]
         self._curves = [target.vertices for target in targets]
         paths = [player.body.anatomy.hips_world for player in self.players]
         grid = overlays.build_grid(np.concatenate([*paths, *self._curves])[:, [0, 2]])
-        self._still = merge_surfaces([grid, *targets, *props])
+        terrain = [] if ground is None else [overlays.build_ground(ground)]
+        self._still = merge_surfaces([grid, *terrain, *(overlays.drape(target, ground) for target in targets), *props])
+        self._ground = ground
 
     def content(self, film_frame: int) -> Content:
         figures = [Figure(player.body, player.frame(film_frame)) for player in self.players]
         trails = [overlays.cut_ribbon(p.trail, f.frame + 1) for p, f in zip(self.players, figures, strict=True)]
         marks = [_build_contact_marks(p, f.frame) for p, f in zip(self.players, figures, strict=True)]
         asked = [mark for player in self.players for mark in player.marks_at(film_frame)]
-        ground = [self._still, *trails, *(m for m in marks if m is not None), *asked]
-        return Content(ground, figures, self._veils)
+        flat = [overlays.drape(each, self._ground) for each in (*trails, *(m for m in marks if m is not None))]
+        return Content([self._still, *flat, *asked], figures, self._veils, self._ground)
 
     def compose_ghosts(self, film_frames: Sequence[int]) -> Content:
         """Compose all actors at several times, earlier ones paler, with the whole trails and all that is requested."""
@@ -126,9 +135,9 @@ class Stage:
             # A later ghost replaces one in the same pose: an actor that waits or has arrived.
             for frame, fade in {player.frame(at): float(fade) for at, fade in moments}.items()
         ]
-        trails = [player.trail for player in self.players]
+        trails = [overlays.drape(player.trail, self._ground) for player in self.players]
         marks = [mark for player in self.players for mark, _, _ in player.marks]
-        return Content([self._still, *trails, *marks], figures, self._veils)
+        return Content([self._still, *trails, *marks], figures, self._veils, self._ground)
 
     def views(self, settings: CameraSettings, size: tuple[int, int]) -> list[View]:
         """Return one view a frame that shows all actors, and all curves unless the camera follows."""
@@ -141,7 +150,7 @@ class Stage:
         return compute_views(settings, seen, np.mean(hips, axis=0), fps=float(self.fps), size=size)
 
 
-def _prepare_actor(shot: Shot, number: int, count: int, fps: Fraction) -> StagedActor:
+def _prepare_actor(shot: Shot, number: int, count: int, fps: Fraction, ground: Ground | None) -> StagedActor:
     if not 0 <= shot.start_seconds < 3600:
         raise RequestError(f"start_seconds must be from 0 to 3600, got {shot.start_seconds:g}")
     colour = colours.rgb(shot.colour or colours.default_colour(number))
@@ -155,7 +164,10 @@ def _prepare_actor(shot: Shot, number: int, count: int, fps: Fraction) -> Staged
     balls = [foot.ball for foot in body.anatomy.feet]
     planted = np.zeros((body.num_frames, len(balls)), bool)
     if len(balls) == 2:
-        planted = detect_contacts(torch.from_numpy(body.anatomy.points.world[:, balls]), float(fps)).numpy()
+        world = torch.from_numpy(body.anatomy.points.world[:, balls]).clone()
+        if ground is not None:
+            world[..., 1] -= ground.height(world[..., ::2])
+        planted = detect_contacts(world, float(fps)).numpy()
     marks = []
     for mark in shot.targets.marks:
         early, late = mark.seconds

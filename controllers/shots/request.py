@@ -18,6 +18,7 @@ from mapctl.curves import Curve
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS, GroundPose, encode, integrate_root
+from mapctl.ground import Ground
 from mapctl.intent.keyframes import WorldPosition
 from mapctl.intent.path import SpeedProfile, TimedSpeed, find_reversals
 from mapctl.kinematics.moving import bring_curve_points, measure_travel, move_to, rotate_about_vertical
@@ -292,6 +293,8 @@ class ShotRequest:
     """Others to keep apart from."""
     labels: tuple[str, ...] = ()
     """Labels on which the prior is conditioned; the gait that they name is measured."""
+    ground: Ground | None = None
+    """Ground that is not flat, onto which the motion is put."""
 
     @cached_property
     def walks_only(self) -> bool:
@@ -322,6 +325,11 @@ class ShotRequest:
             "a loop needs a closed curve, and this one is open": self.loop and not self.curve.closed,
             "a loop is walked once around, in its stride: without start, end, seconds, speeds by time": self.loop
             and (ends or self.seconds is not None or timed),
+            "on a ground a shot has a curve of x,z, standing ends and obstacles: no keys, clips, footsteps or loop": (
+                self.ground is not None
+                and bool(self.reaches or self.looks or self.poses or self.footsteps or self.loop)
+                | (self.lead is not None or self.arrival is not None or self.curve.dims == 3)
+            ),
         }
         if fault := next((what for what, holds in faults.items() if holds), None):
             raise RequestError(fault)

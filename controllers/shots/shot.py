@@ -15,7 +15,7 @@ import torch
 from controllers.common.character import Character
 from controllers.inbetweening.pipeline import fill
 from controllers.shots.constraints import Constraint, check_constraints, describe_conflicts
-from controllers.shots.footsteps import find_footsteps
+from controllers.shots.footsteps import Footstep, find_footsteps
 from controllers.shots.reaching import (
     MetPose,
     ReachTargets,
@@ -33,10 +33,12 @@ from controllers.shots.reaching import (
 from controllers.shots.request import Reach, ShotRequest
 from controllers.shots.seams import OVERLAP, JoinedPieces, arrive, close_loop, fill_frames, go_on, join_pieces
 from controllers.shots.trajectory import Trajectory, plan_trajectory
+from controllers.shots.uneven import Footing, slow_on_stairs, step_onto_ground
 from controllers.shots.walk import FollowSettings, check_path, check_tracking, slows_in_corners, walk_spans
 from mapctl.curves import Curve
 from mapctl.errors import RequestError
-from mapctl.intent.path import SpeedProfile
+from mapctl.ground import Ground
+from mapctl.intent.path import SpeedProfile, TimedSpeed, walk_at_ease
 from mapctl.motion import Motion
 from mapctl.problem.solution import Ledger, Solution, Status
 from mapctl.protocols import Density, Inbetweener
@@ -57,12 +59,17 @@ class ShotSolution(Solution):
     """Reaches at the times at which they were met, those of keys' hands and feet included."""
     met: tuple[MetPose, ...] = ()
     """Keys of poses, positions and facings, as they were met."""
+    footing: Footing | None = None
+    """How feet stand and swing on a ground that is not flat."""
+    footsteps: tuple[Footstep, ...] = ()
+    """Steps of the motion."""
 
     def details(self) -> dict:
-        """Return the constraints and the footsteps."""
+        """Return the constraints, the footsteps, and how feet stand on a ground."""
         return {
             "constraints": [constraint.as_row() for constraint in self.constraints],
-            "footsteps": [step.as_row() for step in find_footsteps(self.motion)],
+            "footsteps": [step.as_row() for step in self.footsteps],
+            **({} if self.footing is None else {"footing": self.footing.as_row()}),
         }
 
 
@@ -90,7 +97,8 @@ def solve_shot(
         raise RequestError("standing, reversing, keys and clips need an in-betweener, and none is given")
     began, settings = time.perf_counter(), settings or FollowSettings()
     character = Character(skeleton, settings.footing.rest_height)
-    trajectory = plan_trajectory(request)
+    limits = character.data_limits(prior.limits)
+    trajectory = plan_trajectory(_slow_on_stairs(request, limits.slowest))
     rest = build_rest_pose(prior, skeleton, character.toe_rest_height)
     limb_keys = as_reaches(request.poses, trajectory, rest)
     poses = tuple(key for key in request.poses if not key.joints)
@@ -120,11 +128,15 @@ def solve_shot(
     notes = [trajectory.note] if trajectory.note else []
     if request.walks_only:
         if request.speed is not None:
-            notes += check_path(trajectory.curve, trajectory.arcs, character.data_limits(prior.limits))
+            notes += check_path(trajectory.curve, trajectory.arcs, limits)
         notes += check_tracking(motion, trajectory.curve)
     trajectory = trajectory.slice(motion.num_frames)
     constraints = check_constraints(replace(request, reaches=reaches), trajectory, motion, met)
     notes += describe_conflicts(constraints, trajectory, motion)
+    footing, footsteps = None, find_footsteps(motion)
+    if request.ground is not None:
+        motion, footing, footsteps = step_onto_ground(motion, request.ground, character.toe_rest_height)
+        notes += footing.notes
     return ShotSolution(
         motion,
         Status(outcome).with_notes(notes, infeasible=bool(notes)),
@@ -136,7 +148,18 @@ def solve_shot(
         constraints=constraints,
         reaches=reaches,
         met=met,
+        footing=footing,
+        footsteps=tuple(footsteps),
     )
+
+
+def _slow_on_stairs(request: ShotRequest, slowest: float) -> ShotRequest:
+    """Return the request with speeds along stairs at which a step is one tread long; speeds by time stay."""
+    if request.ground is None or isinstance(request.speed, TimedSpeed):
+        return request
+    asked = request.speed or walk_at_ease(request.curve)
+    speed = slow_on_stairs(asked, request.curve, request.ground, slowest)
+    return request if speed is asked else replace(request, speed=speed)
 
 
 def _finish_ends(
@@ -178,6 +201,7 @@ def follow(
     *,
     seconds: float | None = None,
     speed: float | SpeedProfile | None = None,
+    ground: Ground | None = None,
     inbetweener: Inbetweener | None = None,
     generator: torch.Generator | None = None,
     settings: FollowSettings | None = None,
@@ -189,14 +213,14 @@ def follow(
     """Walk a character along a curve from its first point, facing along it: a shot with nothing but a curve.
 
     `speed` is m/s or a profile along the arc; without one it is the usual speed, and less in corners. Without `seconds`
-    the curve is walked once. An `inbetweener` is needed where the curve reverses. See `solve_shot` for the rest.
+    the curve is walked once. On a `ground` that is not flat feet stand on its levels and slopes. An `inbetweener` is needed where the curve reverses. See `solve_shot` for the rest.
     RequestError for requests that make no sense; infeasible ones are named with numbers in the status.
     """
     profile = SpeedProfile.constant(speed) if isinstance(speed, float | int) else speed
     return solve_shot(
         prior,
         inbetweener,
-        ShotRequest(curve, profile, seconds),
+        ShotRequest(curve, profile, seconds, ground=ground),
         generator=generator,
         settings=settings,
         skeleton=skeleton,

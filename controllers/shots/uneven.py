@@ -128,6 +128,20 @@ class Footing:
     """Steepest slope that a foot stands on, radians."""
     highest: float
     """Highest step from one foothold to the next."""
+    planted_share: float
+    """Share of foot-frames that stand."""
+    contact_speed: float
+    """Mean speed of toes that stand, m/s."""
+
+    def as_row(self) -> dict[str, float]:
+        """Return the row of a report, centimetres and degrees."""
+        return {
+            "edge_clearance_min_cm": 100 * self.clearance,
+            "penetration_max_cm": 100 * self.penetration,
+            "feet_over_edge": self.over_edge,
+            "slope_max_deg": math.degrees(self.steepest),
+            "step_max_cm": 100 * self.highest,
+        }
 
     @property
     def text(self) -> str:
@@ -393,6 +407,7 @@ def _measure(
     toes, turns = (values.double() for values in (done.joint_positions(), done.joint_rotations()))
     flat, flat_turns = (values.double() for values in (motion.joint_positions(), motion.joint_rotations()))
     clearance, depth, level = math.inf, 0.0, torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    speeds = list[Tensor]()
     for foot, (sole, track) in enumerate(zip(soles, tracks, strict=True)):
         toe, ankle = CANONICAL.index(TOES[foot]), CANONICAL.index(FEET[foot])
         points = sole.points(toes[:, toe], turns[:, ankle], track.up)
@@ -401,6 +416,7 @@ def _measure(
         depth = max(depth, float((before.clamp(max=0) - over).max()))
         edge, highest = _is_near_edge(points, ground)
         passing = edge & ~track.standing[:, None]
+        speeds.append((points[1:, 1] - points[:-1, 1]).norm(dim=-1)[track.standing[1:] & track.standing[:-1]] * PRIOR_FPS)
         if bool(passing.any()):
             clearance = min(clearance, float((points[..., 1] - highest)[passing].min()))
     ordered = [hold.height for hold in holds]
@@ -410,4 +426,6 @@ def _measure(
         sum(hold.over_edge > EDGE / 2 for hold in holds),
         math.atan(max(float(hold.gradient.norm()) for hold in holds)),
         max((abs(other - one) for one, other in pairwise(ordered)), default=0.0),
+        float(torch.stack([track.standing for track in tracks]).double().mean()),
+        float(torch.cat(speeds).mean()),
     )

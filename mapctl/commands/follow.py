@@ -14,6 +14,7 @@ from mapctl.commands.shared.command import ModelCommand, conclude
 from mapctl.commands.shared.shots import build_obstacles, plan_shot, play_shot, stage_actor
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
+from mapctl.ground import Ground
 from mapctl.intent.shot_keys import ShotKeyFile
 from mapctl.report import write_report
 from scenes.film import film
@@ -38,6 +39,8 @@ class FollowCurve(ModelCommand, options.ReadOptions, ShotOptions):
     """TOML file of [[key]] tables: what hands and feet reach for, the head looks at, which pose is held, and when."""
     avoid: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="X,Z,RADIUS")] = ()
     """A disc on the ground to walk around, metres; may be given several times."""
+    ground: options.MaybeFile = None
+    """TOML file of the ground, where it is not flat: boxes, ramps, stairs or a grey picture as a height field."""
     variations: options.Count = 1
     """Number of takes, each with the next seed; their files are OUT_000, OUT_001, ..."""
     fps: options.MaybeNumber = None
@@ -89,6 +92,7 @@ def _follow(command: FollowCurve, file: ShotKeyFile | None) -> int:
         folder=Path(),
         options=command,
         obstacles=[Obstacle.parse(text) for text in command.avoid],
+        ground=None if command.ground is None else Ground.read(command.ground),
         fps=None if command.fps is None else Fraction(command.fps).limit_denominator(100_000),
     )
     with outputs.show_progress("walking", quiet=command.quiet) as progress:
@@ -99,7 +103,14 @@ def _follow(command: FollowCurve, file: ShotKeyFile | None) -> int:
     video = None if done.interrupted else command.video
     if video is not None:
         with outputs.show_progress("filming", quiet=command.quiet) as progress:
-            film([stage_actor(done)], video, size=outputs.FILM_SIZE, props=build_obstacles([done]), progress=progress)
+            film(
+                [stage_actor(done)],
+                video,
+                size=outputs.FILM_SIZE,
+                props=build_obstacles([done]),
+                ground=plan.request.ground,
+                progress=progress,
+            )
     if not command.quiet:
         files = ", ".join(map(str, options.collect_paths(command.out, video, command.report)))
         print("\n".join([*done.summary(), f"wrote     {files}"]))

@@ -9,6 +9,7 @@ from mapctl import curves
 from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.command import Command
 from mapctl.curves import Curve
+from mapctl.ground import Ground
 from mapctl.motion import Motion
 from mapctl.retarget import put_upright
 from mapctl.retarget.rigs import Rig
@@ -31,6 +32,8 @@ class Render(Command, options.RigOptions):
     character: options.MaybeCharacter = None
     """File of a skinned character, as .glb or .vrm, that is drawn in place of the mannequin: with its own mesh, moved
     as `mapctl convert --rig` moves it. A motion that is read from that file needs no conversion."""
+    ground: options.MaybeFile = None
+    """TOML file of the ground, where it is not flat (see `mapctl follow --help`)."""
     camera: Annotated[options.CameraKind, arg(metavar="follow|fixed|top")] = "follow"
     """Camera that follows, is fixed with all in view, or looks from above."""
     size: options.Size = "1280x720"
@@ -44,12 +47,13 @@ def run(command: Render) -> int:
     size = options.parse_size(command.size)
     outputs.check_film(command.out, size)
     curve = None if command.curve is None else curves.read(command.curve, metres_per_unit=command.metres_per_unit)
+    ground = None if command.ground is None else Ground.read(command.ground)
     rig = inputs.read_rig(command.rig, command)
     motion = inputs.read_motion(command.source, rig, quiet=command.quiet)
     shot, notes = _prepare_shot(motion, rig, curve, command.character)
     with outputs.show_progress("filming", quiet=command.quiet) as progress:
         camera = CameraSettings(command.camera)
-        film([shot], command.out, camera=camera, size=size, progress=progress)
+        film([shot], command.out, camera=camera, size=size, ground=ground, progress=progress)
     if not command.quiet:
         print("\n".join((f"{command.out}: {shot.motion.seconds:.1f} s of {size[0]}x{size[1]}", *notes)))
     return 0

@@ -1,5 +1,6 @@
 """Shots of actors, planned and solved, with their measures and cost, for follow, run and demo."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -27,6 +28,7 @@ from mapctl.curves import Curve, smooth_path
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
+from mapctl.ground import Ground
 from mapctl.intent.path import SpeedProfile, TimedSpeed
 from mapctl.intent.shot_keys import ShotKey
 from mapctl.mesh.primitives import Surface
@@ -67,6 +69,7 @@ def plan_shot(
     folder: Path,
     options: ReadOptions,
     obstacles: Sequence[Obstacle] = (),
+    ground: Ground | None = None,
     fps: Fraction | None = None,
 ) -> ShotPlan:
     """Plan an actor's shot; a clip from which it continues or in which it ends determines its body and its rate.
@@ -143,6 +146,7 @@ def plan_shot(
         ),
         obstacles=tuple(obstacles),
         labels=labels,
+        ground=ground,
     )
     return ShotPlan(actor, request, prior.conditioned_on(labels) if labels else prior, character, rate, note)
 
@@ -170,6 +174,10 @@ def _build_pose_key(key: ShotKey, seconds: float, within: int, read: Callable[[s
 
 
 _BESIDE = 6  # frames after the last
+_OF_FLAT_FLOORS = (
+    *("skate_cm_s", "skate_ratio", "penetration_cm", "float_cm", "glide_cm", "slide_max_cm", "unsupported_max_s"),
+    *("depth_max_cm", "heel_contact_speed_cm_s", "heel_planted_share", "heel_slide_max_cm", "foot_turn_deg_s"),
+)
 
 
 def resample_shot(solution: ShotSolution, request: ShotRequest, fps: Fraction) -> Motion:
@@ -220,8 +228,12 @@ class PlayedShot:
     @cached_property
     def measures(self) -> Mapping[str, float]:
         """Measures of the motion against the trajectory that was planned."""
-        planned = self.solution.trajectory
-        return report.measure_path(self.solution.motion, planned.curve, wanted_m=float(planned.arcs[-1]))
+        planned, footing = self.solution.trajectory, self.solution.footing
+        found = report.measure_path(self.solution.motion, planned.curve, wanted_m=float(planned.arcs[-1]))
+        if footing is None:
+            return found
+        own = {"planted_share": footing.planted_share, "contact_speed_cm_s": 100 * footing.contact_speed}
+        return {**found, **dict.fromkeys(_OF_FLAT_FLOORS, math.nan), **own}
 
     def report(self, request: Mapping[str, Any]) -> dict[str, Any]:
         """Build the report of this shot; `request` is what the user wrote."""
@@ -245,6 +257,7 @@ class PlayedShot:
             f"path      error {m['path_error_mean_cm']} cm mean, {m['path_error_max_cm']} max; sway {m['sway_cm']} cm",
             f"progress  {m['travelled_m']} of {m['wanted_m']} m",
             f"feet      planted {planted:.0%} of the time, then moving {m['contact_speed_cm_s']} cm/s",
+            *([] if self.solution.footing is None else [f"ground    {self.solution.footing.text}"]),
             *constraints,
         ]
         if self.solution.windows:
