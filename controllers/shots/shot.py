@@ -33,7 +33,7 @@ from controllers.shots.reaching import (
 from controllers.shots.request import Reach, ShotRequest
 from controllers.shots.seams import OVERLAP, JoinedPieces, arrive, close_loop, fill_frames, go_on, join_pieces
 from controllers.shots.trajectory import Trajectory, plan_trajectory
-from controllers.shots.uneven import Footing, slow_on_stairs, step_onto_ground
+from controllers.shots.uneven import Footing, Stairs, step_onto_ground
 from controllers.shots.walk import FollowSettings, check_path, check_tracking, slows_in_corners, walk_spans
 from mapctl.curves import Curve
 from mapctl.errors import RequestError
@@ -98,7 +98,11 @@ def solve_shot(
     began, settings = time.perf_counter(), settings or FollowSettings()
     character = Character(skeleton, settings.footing.rest_height)
     limits = character.data_limits(prior.limits)
-    trajectory = plan_trajectory(_slow_on_stairs(request, limits.slowest))
+    stairs, planned = Stairs.find(request.curve, request.ground), request
+    if stairs.treads and not isinstance(request.speed, TimedSpeed):
+        speed = stairs.slow(request.speed or walk_at_ease(request.curve), request.curve, limits.slowest)
+        planned = replace(request, speed=speed)
+    trajectory = plan_trajectory(planned)
     rest = build_rest_pose(prior, skeleton, character.toe_rest_height)
     limb_keys = as_reaches(request.poses, trajectory, rest)
     poses = tuple(key for key in request.poses if not key.joints)
@@ -116,7 +120,11 @@ def solve_shot(
         character=character,
         settings=settings,
         generator=generator or torch.Generator().manual_seed(0),
-        terms_of=lambda first, frames: (*terms, *reach.terms(skeleton, first, frames)),
+        terms_of=lambda first, frames: (
+            *terms,
+            *reach.terms(skeleton, first, frames),
+            *stairs.terms(trajectory, first, frames),
+        ),
         progress=progress,
         deadline=None if deadline_seconds is None else time.monotonic() + deadline_seconds,
     )
@@ -151,15 +159,6 @@ def solve_shot(
         footing=footing,
         footsteps=tuple(footsteps),
     )
-
-
-def _slow_on_stairs(request: ShotRequest, slowest: float) -> ShotRequest:
-    """Return the request with speeds along stairs at which a step is one tread long; speeds by time stay."""
-    if request.ground is None or isinstance(request.speed, TimedSpeed):
-        return request
-    asked = request.speed or walk_at_ease(request.curve)
-    speed = slow_on_stairs(asked, request.curve, request.ground, slowest)
-    return request if speed is asked else replace(request, speed=speed)
 
 
 def _finish_ends(

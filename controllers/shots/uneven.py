@@ -20,6 +20,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from controllers.shots.footsteps import Footstep, bend_legs, find_ankles
+from controllers.shots.trajectory import Trajectory
 from mapctl import contacts, kinematics, rotations
 from mapctl.curves import Curve
 from mapctl.features import PRIOR_FPS
@@ -33,6 +34,7 @@ from mapctl.numerics.smooth_offsets import smooth_between
 from mapctl.retarget.carry import lower_hips
 from mapctl.retarget.character import LEGS, limb_extension
 from mapctl.skeleton import CANONICAL, FEET, TOES, find_heels
+from mapctl.terms import RootVelocity, StepLength, Term
 
 STEEPEST = math.radians(15.0)
 """Slope up to which feet are put onto ground as on a flat floor, radians."""
@@ -46,11 +48,15 @@ _STEP_SECONDS = 0.5  # of a step of slow walks, whatever its length: `mapctl fol
 _DEEPEST = 0.6  # metres of a tread that is taken in one step
 _BEFORE = 0.6  # metres before stairs, and after them, that are walked as slowly
 _EDGE_HEIGHT = 0.05  # metres of an edge of stairs
+_FACING, _STEP_SIGMA = 0.2, 0.03  # radians and metres by which hips and steps on stairs differ from path and treads
 _MARGIN, _HALF_WIDTH = 0.02, 0.04  # metres between a sole's ends and an edge, and of half a sole
+_MARGINS = ((-0.06, -0.03), (0.0, 0.0), (0.01, 0.01), (_MARGIN, _MARGIN))  # at heel and tip; a heel may stick out
 _FARTHEST, _GRID = 0.4, 0.01  # metres that a foothold is moved by at most, and between those that are tried
 _MOVED, _UNEVEN, _TOO_HIGH = 0.1, 0.004, 0.01  # metres that cost the same: moved, of a sole's rest, over HIGHEST
 _HIPS_SECONDS, _HEADING_SECONDS = 0.15, 0.3  # over which hips follow the feet, and the direction of travel is the mean
 _BENDS_HERTZ = 4.0  # of a swing's trajectory
+_AHEAD = 0.15  # metres before a sole in which a riser is looked for
+_MOMENTS = 5  # from a frame to the next at which swing feet are measured
 _LIFT_ACCELERATION = 20.0  # m/s^2 with which a foot is lifted further at most
 
 
@@ -74,15 +80,15 @@ class Sole(NamedTuple):
 
     def points(
         self, toes: Float[Tensor, "frames 3"], turns: Float[Tensor, "frames 4"], up: Float[Tensor, "frames 4"]
-    ) -> Float[Tensor, "frames 3 3"]:
-        """Return the points of a foot, world, metres, from its toe joint and rotation: toes stay level on the slope
-        (the rotation `up`) while the heel is raised."""
+    ) -> Float[Tensor, "frames 4 3"]:
+        """Return heel, arch, ball and tip of a foot, world, metres, from its toe joint and rotation: toes stay level on
+        the slope (the rotation `up`) while the heel is raised."""
         heel, ball, straight = (rotations.rotate(turns, point.expand_as(toes)) for point in self)
         own = rotations.rotate(rotations.inverse(up), straight - ball)
         level = own * own.new_tensor([1.0, 0.0, 1.0])
         level = torch.nn.functional.normalize(level, dim=-1) * own.norm(dim=-1, keepdim=True)
         low = rotations.rotate(up, toes.new_tensor([0.0, self.ball[1], 0.0]).expand_as(toes)) + rotations.rotate(up, level)
-        return toes[:, None] + torch.stack([heel, ball, torch.where(own[:, 1:2] < 0, low, straight)], dim=1)
+        return toes[:, None] + torch.stack([heel, 0.5 * (heel + ball), ball, torch.where(own[:, 1:2] < 0, low, straight)], dim=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,8 +109,8 @@ class Foothold:
     """Height of the plane below the toe joint, metres."""
     gradient: Float[Tensor, "2"] = torch.zeros(2, dtype=torch.float64)
     """Rise of the plane along x and along z."""
-    over_edge: float = 0.0
-    """Height by which the ground under the sole differs from one plane, metres."""
+    over_edge: bool = False
+    """Whether the ground under the sole is not one plane."""
 
     @property
     def up(self) -> Float[Tensor, "4"]:
@@ -119,7 +125,7 @@ class Footing:
     """How feet stand and swing on uneven ground; metres."""
 
     clearance: float
-    """Lowest height of a swing foot over an edge that it passes; infinite where it passes none."""
+    """Lowest height of a swing foot less than 1 cm beyond an edge that it passes; infinite where it passes none."""
     penetration: float
     """Deepest point of a sole in the ground, beyond that over the flat floor."""
     over_edge: int
@@ -168,15 +174,45 @@ class Footing:
         return tuple(found)
 
 
-def slow_on_stairs(profile: SpeedProfile, curve: Curve, ground: Ground, slowest: float) -> SpeedProfile:
-    """Lower speeds, m/s, where a path has edges less than a step apart, so that a step is one tread long; to `slowest`
-    at most, m/s."""
-    arcs = torch.linspace(0, curve.length, max(2, round(curve.length / _GRID) + 1), dtype=torch.float64)
-    heights = ground.height(curve.ground_point(arcs))
-    edges = [float(arcs[start]) for _, start, _ in true_intervals((heights.diff().abs() > _EDGE_HEIGHT)[:, None])]
-    treads = [(one, other) for one, other in pairwise(edges) if other - one < _DEEPEST]
-    limits = [(one - _BEFORE, other + _BEFORE, max(slowest, (other - one) / _STEP_SECONDS)) for one, other in treads]
-    return limit_speeds(profile, curve, limits)
+@dataclass(frozen=True)
+class Stairs:
+    """Treads of a path that are shorter than a step, and how they are walked: slowly, a step a tread."""
+
+    treads: tuple[tuple[float, float], ...] = ()
+    """Arcs of the edges before each and after it, metres."""
+
+    @staticmethod
+    def find(curve: Curve, ground: Ground | None) -> "Stairs":
+        """Find the treads along a path over a ground; none without one."""
+        if ground is None:
+            return Stairs()
+        arcs = torch.linspace(0, curve.length, max(2, round(curve.length / _GRID) + 1), dtype=torch.float64)
+        rises = ground.height(curve.ground_point(arcs)).diff().abs() > _EDGE_HEIGHT
+        edges = [float(arcs[start]) for _, start, _ in true_intervals(rises[:, None])]
+        return Stairs(tuple((one, other) for one, other in pairwise(edges) if other - one < _DEEPEST))
+
+    def slow(self, profile: SpeedProfile, curve: Curve, slowest: float) -> SpeedProfile:
+        """Lower speeds, m/s, so that a step is one tread long; to `slowest` at most, m/s."""
+        limits = [
+            (one - _BEFORE, other + _BEFORE, max(slowest, (other - one) / _STEP_SECONDS)) for one, other in self.treads
+        ]
+        return limit_speeds(profile, curve, limits)
+
+    def terms(self, trajectory: Trajectory, first: int, frames: int) -> tuple[Term, ...]:
+        """Return the terms of a window from frame `first` on: on treads steps are as long as these, and hips face along
+        the path, from which slow walks turn them."""
+        if not self.treads:
+            return ()
+        arcs = trajectory.arcs[torch.arange(first, first + frames).clamp(max=len(trajectory.arcs) - 1)]
+        found = torch.tensor([(one, other) for one, other in self.treads], dtype=torch.float64).reshape(-1, 1, 2)
+        on = ((arcs > found[..., 0] - _BEFORE) & (arcs < found[..., 1] + _BEFORE)).any(dim=0)
+        if not bool(on.any()):
+            return ()
+        still, facing = torch.zeros(len(arcs), 2), rotations.unwrap_angle(trajectory.curve.heading(arcs))
+        face = RootVelocity(still, still[:0], facing, sigma_speed=math.inf, sigma_facing=_FACING, name="facing")
+        if float(on.double().mean()) < 0.5:
+            return (face,)
+        return face, StepLength(sum(other - one for one, other in self.treads) / len(self.treads), sigma=_STEP_SIGMA)
 
 
 def step_onto_ground(motion: Motion, ground: Ground, rest_height: float) -> tuple[Motion, Footing, list[Footstep]]:
@@ -234,7 +270,7 @@ def _choose_footholds(holds: Sequence[Foothold], motion: Motion, ground: Ground,
         found.append((moved, *_fit_planes(hold.toe + moved, yaw, ground, soles[hold.foot])))
     cost, came = torch.zeros_like(offsets), []
     between = ((offsets[:, None] - offsets) / _MOVED).square()
-    for number, (_, heights, _, uneven) in enumerate(found):
+    for number, (_, heights, _, uneven, _) in enumerate(found):
         if number:
             rise = (heights - found[number - 1][1][:, None]).abs() - HIGHEST
             cost, back = (cost[:, None] + between + (rise.clamp_min(0) / _TOO_HIGH).square()).min(dim=0)
@@ -242,32 +278,32 @@ def _choose_footholds(holds: Sequence[Foothold], motion: Motion, ground: Ground,
         cost = cost + (offsets / _MOVED).square() + (uneven / _UNEVEN).square()
     at, chosen = int(cost.argmin()), []
     for number in range(len(holds) - 1, -1, -1):
-        moved, heights, gradients, uneven = (values[at] for values in found[number])
-        chosen.append(
-            replace(
-                holds[number], moved=moved, height=float(heights), gradient=gradients, over_edge=float(uneven)
-            )
-        )
+        moved, heights, gradients, _, over = (values[at] for values in found[number])
+        hold = replace(holds[number], moved=moved, height=float(heights), gradient=gradients, over_edge=bool(over))
+        chosen.append(hold)
         at = int(came[number - 1][at]) if number else at
     return chosen[::-1]
 
 
 def _fit_planes(
     toes: Float[Tensor, "n 2"], yaw: Tensor, ground: Ground, sole: Sole
-) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 2"], Float[Tensor, " n"]]:
+) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 2"], Float[Tensor, " n"], Bool[Tensor, " n"]]:
     """Fit planes to the ground under soles with toe joints at points (x, z): heights below these, gradients along x and
-    z, and by how much the ground differs from the planes, metres."""
-    back, front = (float((end - sole.ball)[::2].norm()) + _MARGIN for end in (sole.heel, sole.tip))
-    along = torch.tensor([-back, 0.5 * (front - back), front], dtype=torch.float64)
-    aside = torch.tensor([-_HALF_WIDTH, 0.0, _HALF_WIDTH], dtype=torch.float64)
-    under = rotations.rotate_ground(torch.cartesian_prod(aside, along), yaw)
-    heights = ground.height(toes[:, None] + under)
-    axes = torch.cat([torch.ones_like(under[:, :1]), under], dim=-1)
-    planes = heights @ torch.linalg.pinv(axes).T
-    off = (heights - planes @ axes.T).abs().amax(dim=-1)
-    level = off > EDGE / 2  # over an edge the foot stands on what is higher
-    height = torch.where(level, heights.amax(dim=-1), planes[:, 0])
-    return height, torch.where(level[:, None], 0.0, planes[:, 1:]), off
+    z, and by how much the ground differs from the planes, metres: the mean of soles from a shorter to a longer one.
+    Also whether the sole itself is over an edge."""
+    found = []
+    for heel, tip in _MARGINS:
+        along = torch.stack([sole.heel[2] - heel, (sole.heel[2] + sole.tip[2]) / 2, sole.tip[2] + tip])
+        aside = along.new_tensor([-_HALF_WIDTH, 0.0, _HALF_WIDTH])
+        under = rotations.rotate_ground(torch.cartesian_prod(aside, along), yaw)
+        heights = ground.height(toes[:, None] + under)
+        axes = torch.cat([torch.ones_like(under[:, :1]), under], dim=-1)
+        planes = heights @ torch.linalg.pinv(axes).T
+        found.append((planes, (heights - planes @ axes.T).abs().amax(dim=-1), heights.amax(dim=-1)))
+    planes, off, highest = (torch.stack(values) for values in zip(*found, strict=True))
+    over = off > EDGE / 2  # over an edge a foot stands on what is higher under the shortest sole
+    planes = torch.where(over[0, :, None], torch.nn.functional.pad(highest[0, :, None], (0, 2)), planes[0])
+    return planes[:, 0], planes[:, 1:], off.mean(dim=0), over[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,7 +328,7 @@ class _FootTrack:
     @staticmethod
     def of(holds: Sequence[Foothold], toe: Float[Tensor, "frames 3"], ground: Ground, sole: Sole) -> "_FootTrack":
         frames, flat = len(toe), toe[:, ::2]
-        moved, height, up, bent = (toe.new_zeros(frames, width) for width in (2, 1, 4, 3))
+        moved, height, up, bent, back = (toe.new_zeros(frames, width) for width in (2, 1, 4, 3, 3))
         for hold in holds:
             held = slice(hold.start, hold.stop)
             moved[held], up[held] = hold.moved, hold.up
@@ -302,9 +338,14 @@ class _FootTrack:
             swing = slice(one.stop, other.start)
             away, clock = other.toe - one.toe, torch.arange(one.stop, other.start)
             if float(away.norm()) > _MOVED:
-                share = ((flat[swing] - one.toe) @ away / away.square().sum()).clamp(0, 1)
+                share = (flat[swing] - one.toe) @ away / away.square().sum()
             else:
                 share = smootherstep((clock - one.stop + 1) / (other.start - one.stop + 1)).to(toe)
+            if _is_blocked(one, other, ground, sole):  # a foot that swings farther than it lands would meet a riser
+                farthest = share.cummax(dim=0).values
+                steady = (farthest / farthest[-1]).clamp_min(0)
+                back[swing], share = rotations.lift_ground((steady - share)[:, None] * away), steady
+            share = share.clamp(0, 1)
             moved[swing] = torch.lerp(one.moved, other.moved, share[:, None])
             height[swing, 0] = one.height + (other.height - one.height) * share
             up[swing] = rotations.slerp(one.up.expand(len(share), 4), other.up.expand(len(share), 4), share)
@@ -313,7 +354,7 @@ class _FootTrack:
         for start, stop in swings:
             standing[start:stop] = False
         bent = smooth_between(bent, standing, hertz=_BENDS_HERTZ, fps=PRIOR_FPS)
-        base = bent.clone()
+        base = bent + back
         base[:, ::2] += flat + moved
         base[:, 1] += height[:, 0]
         return _FootTrack(base, up, moved, height[:, 0], toe[:, 1], swings, standing)
@@ -326,7 +367,8 @@ class _FootTrack:
         level[:, 3], upright[:, 1] = 1.0, self.rest
         toe = self.base + rotations.rotate(self.up, upright)
         flat, points = sole.points(upright, flat_turns, level), sole.points(toe, turns, self.up)
-        need = (_find_required(points, flat[..., 1], ground) - points[..., 1]).amax(dim=-1)
+        need = _find_need(_sample_between(points), _sample_between(flat)[..., 1], ground)
+        need = torch.nn.functional.pad(need, (1, 1), value=-torch.inf).unfold(0, 2, 1).amax(dim=-1)
         for start, stop in self.swings:
             toe[start:stop, 1] += _lift_smoothly(need[start:stop])
         return toe
@@ -358,6 +400,17 @@ def _stretch_over(
     return torch.stack([forward * ahead[0], up, forward * ahead[1]], dim=-1)
 
 
+def _is_blocked(one: Foothold, other: Foothold, ground: Ground, sole: Sole) -> bool:
+    """Return whether the ground rises in front of a foothold, or of the one before."""
+    ahead = torch.nn.functional.normalize(other.toe + other.moved - one.toe - one.moved, dim=0)
+    reach = torch.arange(0, float(sole.tip[2]) + _AHEAD, _GRID, dtype=torch.float64)
+    rises = [
+        ground.height(hold.toe + hold.moved + reach[:, None] * ahead) - hold.height - hold.gradient @ ahead * reach
+        for hold in (one, other)
+    ]
+    return float(torch.stack(rises).max()) > EDGE
+
+
 def _find_hull(x: Float[ndarray, " n"], y: Float[ndarray, " n"]) -> list[int]:
     """Find the points on the least concave curve over all, from the first to the last (Andrew 1979)."""
     hull = list[int]()
@@ -378,14 +431,20 @@ def _is_near_edge(points: Float[Tensor, "*batch 3"], ground: Ground) -> tuple[Te
     return heights.amax(dim=-1) - heights.amin(dim=-1) > EDGE, heights.amax(dim=-1)
 
 
-def _find_required(
-    points: Float[Tensor, "frames 3 3"], flat: Float[Tensor, "frames 3"], ground: Ground
-) -> Float[Tensor, "frames 3"]:
-    """Find the least heights of a swing foot's points: as over the flat floor up to the clearance, and all of it over
-    edges."""
+def _sample_between(points: Float[Tensor, "frames 4 3"]) -> Float[Tensor, "steps moments 4 3"]:
+    """Sample points at moments from each frame to the next."""
+    share = torch.linspace(0, 1, _MOMENTS, dtype=points.dtype)[:, None, None]
+    return torch.lerp(points[:-1, None], points[1:, None], share)
+
+
+def _find_need(
+    points: Float[Tensor, "steps moments 4 3"], flat: Float[Tensor, "steps moments 4"], ground: Ground
+) -> Float[Tensor, " steps"]:
+    """Find by how much a swing foot is too low from frame to frame: it keeps its height over the flat floor up to the
+    clearance, and all of that over edges."""
     edge, highest = _is_near_edge(points, ground)
     required = ground.height(points[..., ::2]) + flat.clamp(max=CLEARANCE)
-    return torch.where(edge, highest + CLEARANCE, required)
+    return (torch.where(edge, highest + CLEARANCE, required) - points[..., 1]).amax(dim=(1, 2))
 
 
 def _lift_smoothly(need: Float[Tensor, " frames"]) -> Float[Tensor, " frames"]:
@@ -414,16 +473,18 @@ def _measure(
         before = sole.points(flat[:, toe], flat_turns[:, ankle], level.expand(len(flat), 4))[..., 1]
         over = points[..., 1] - ground.height(points[..., ::2])
         depth = max(depth, float((before.clamp(max=0) - over).max()))
-        edge, highest = _is_near_edge(points, ground)
-        passing = edge & ~track.standing[:, None]
-        speeds.append((points[1:, 1] - points[:-1, 1]).norm(dim=-1)[track.standing[1:] & track.standing[:-1]] * PRIOR_FPS)
+        stays = track.standing[1:] & track.standing[:-1]
+        speeds.append(points[:, 2].diff(dim=0).norm(dim=-1)[stays] * PRIOR_FPS)
+        swing = _sample_between(points)[~stays]
+        edge, highest = _is_near_edge(swing, ground)
+        passing = edge & (ground.height(swing[..., ::2]) > highest - EDGE / 2)
         if bool(passing.any()):
-            clearance = min(clearance, float((points[..., 1] - highest)[passing].min()))
+            clearance = min(clearance, float((swing[..., 1] - highest)[passing].min()))
     ordered = [hold.height for hold in holds]
     return Footing(
         clearance,
         depth,
-        sum(hold.over_edge > EDGE / 2 for hold in holds),
+        sum(hold.over_edge for hold in holds),
         math.atan(max(float(hold.gradient.norm()) for hold in holds)),
         max((abs(other - one) for one, other in pairwise(ordered)), default=0.0),
         float(torch.stack([track.standing for track in tracks]).double().mean()),
