@@ -95,6 +95,11 @@ class HeightImage:
     """Middle of the picture, x and z, metres."""
 
 
+PARTS = {"boxes": Box, "ramps": Ramp, "stairs": Stairs, "image": HeightImage}
+"""Parts of a ground by their tables."""
+_SHORTEST = 0.01  # metres of a ramp
+
+
 @dataclass(frozen=True, eq=False)
 class Slab:
     """A rectangle on the ground with a plane as its top."""
@@ -141,21 +146,24 @@ class Ground:
         """Read a TOML file. FileFormatError names file and key."""
 
         def list_allowed_keys(key: Sequence[int | str]) -> str:
-            kinds = {"boxes": Box, "ramps": Ramp, "stairs": Stairs, "image": HeightImage}
-            kind = kinds.get(str(key[0]), Ground) if len(key) > 1 else Ground
+            kind = PARTS.get(str(key[0]), Ground) if len(key) > 1 else Ground
             return f"allowed: {', '.join(item.name for item in fields(kind))}"
 
-        ground = toml.read(path, Ground, what="ground file", unknown=list_allowed_keys)
-        for number, ramp in enumerate(ground.ramps):
-            if math.dist(ramp.start, ramp.end) < 0.01:
-                raise FileFormatError(path, f"ramps[{number}].end: a ramp is 1 cm long at least")
-        if ground.image is not None:
-            image = replace(ground.image, file=str(Path(path).parent / ground.image.file))
-            ground = replace(ground, image=image)
-            _ = ground._pixels  # so that a fault is found now
-        if not ground.slabs and ground.image is None:
-            raise FileFormatError(path, "holds no ground: give [[boxes]], [[ramps]], [[stairs]] or [image]")
-        return ground
+        return toml.read(path, Ground, what="ground file", unknown=list_allowed_keys).located(path)
+
+    def located(self, path: str | PathLike[str]) -> "Ground":
+        """Return the ground with its picture beside the file that it was read from; FileFormatError where a part cannot
+        be."""
+        for number, ramp in enumerate(self.ramps):
+            if math.dist(ramp.start, ramp.end) < _SHORTEST:
+                raise FileFormatError(path, f"ramps[{number}].end: a ramp is {100 * _SHORTEST:g} cm long at least")
+        if self.image is None:
+            if not self.slabs:
+                raise FileFormatError(path, "holds no ground: give boxes, ramps, stairs or an image")
+            return self
+        found = replace(self, image=replace(self.image, file=str(Path(path).parent / self.image.file)))
+        _ = found._pixels  # so that a fault is found now
+        return found
 
     @cached_property
     def slabs(self) -> tuple[Slab, ...]:

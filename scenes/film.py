@@ -202,9 +202,9 @@ def film(
     be left out. Where stick figures are drawn a character is one of them, and a line is logged on that. `out` is a
     path or several, each ending in .mp4, .gif, .webp or .png (a contact sheet: ghosts along the trajectory over a row
     of stills). Each frame of the motions is one frame of the film unless `fps` resamples them. `size` is the width and
-    height in pixels (MP4 rounds up to even). `props` are what stands around (`scenes.overlays`), `ground` what they walk on if it is not flat. `progress` is called
-    with frames done and all frames. `renderer` is that of `scenes.renderers.select_painter`. RequestError for
-    endings, sizes and paths that cannot be.
+    height in pixels (MP4 rounds up to even). `props` are what stands around (`scenes.overlays`), `ground` what
+    they walk on if it is not flat. `progress` is called with frames done and all frames. `renderer` is that of
+    `scenes.renderers.select_painter`. RequestError for endings, sizes and paths that cannot be.
     """
     paths = check_outputs([out] if isinstance(out, str | PathLike) else out, size)
     shots, brush, camera = [Shot(*actor) for actor in actors], select_painter(renderer), camera or CameraSettings()

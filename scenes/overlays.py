@@ -188,7 +188,10 @@ def build_ground(ground: Ground) -> Surface:
     """Build the slabs of a ground, their walls darker than their tops, and its height field."""
     found = []
     if ground.image is not None:
-        x, z = (centre + size * np.linspace(-0.5, 0.5, _FIELD_CELLS) for centre, size in zip(ground.image.centre, ground.image.size, strict=True))
+        x, z = (
+            centre + size * np.linspace(-0.5, 0.5, _FIELD_CELLS)
+            for centre, size in zip(ground.image.centre, ground.image.size, strict=True)
+        )
         flat = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1).reshape(-1, 2)
         vertices = raise_onto(np.insert(flat, 1, 0.0, axis=1), replace(ground, boxes=(), ramps=(), stairs=()))
         index = np.arange(_FIELD_CELLS**2).reshape(_FIELD_CELLS, _FIELD_CELLS)

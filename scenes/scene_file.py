@@ -16,6 +16,7 @@ from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import FileFormatError, MapctlError, RequestError
 from mapctl.formats import toml
 from mapctl.formats.toml import STRICT
+from mapctl.ground import PARTS, Ground
 from mapctl.intent.path import SpeedProfile
 from mapctl.intent.shot_keys import ShotKey
 from mapctl.mesh import colours
@@ -165,6 +166,8 @@ class SceneDescription:
     """Obstacles that all actors walk around, one [[obstacles]] table each."""
     keep_apart: Annotated[float, Field(gt=0, le=10)] | None = None
     """Least distance of the actors' hips, metres; any if not given."""
+    ground: Ground | None = None
+    """Ground that is not flat: [[ground.boxes]], [[ground.ramps]], [[ground.stairs]], [ground.image]."""
     camera: CameraSettings = field(default_factory=CameraSettings)
     """Camera of the film."""
     size: tuple[Annotated[int, Field(ge=16, le=8192)], Annotated[int, Field(ge=16, le=8192)]] = (1280, 720)
@@ -198,7 +201,7 @@ def load(path: str | PathLike[str]) -> tuple[SceneDescription, tuple[Curve, ...]
     except RequestError as error:
         raise FileFormatError(path, str(error)) from error
     named = (replace(a, name=a.name or f"actor{k}") for k, a in enumerate(scene.actors, start=1))
-    scene = replace(scene, actors=tuple(named))
+    scene = replace(scene, actors=tuple(named), ground=scene.ground and scene.ground.located(path))
     _check(path, scene)
     placed = []
     for number, actor in enumerate(scene.actors):
@@ -222,8 +225,8 @@ def transform_curve(actor: Actor, folder: Path) -> Curve:
 
 
 def _list_allowed_keys(key: Sequence[int | str]) -> str:
-    known = {"actors": Actor, "camera": CameraSettings, "obstacles": Obstacle} if len(key) > 1 else {}
-    inner = {"keys": ShotKey, "footsteps": SceneFootstep}
+    known = {"actors": Actor, "camera": CameraSettings, "obstacles": Obstacle, "ground": Ground} if len(key) > 1 else {}
+    inner = {"keys": ShotKey, "footsteps": SceneFootstep, **PARTS}
     table = next((inner[str(part)] for part in key[1:-1] if part in inner), known.get(str(key[0]), SceneDescription))
     return f"allowed: {', '.join(item.name for item in fields(table))}"
 

@@ -212,8 +212,9 @@ def follow(
     """Walk a character along a curve from its first point, facing along it: a shot with nothing but a curve.
 
     `speed` is m/s or a profile along the arc; without one it is the usual speed, and less in corners. Without `seconds`
-    the curve is walked once. On a `ground` that is not flat feet stand on its levels and slopes. An `inbetweener` is needed where the curve reverses. See `solve_shot` for the rest.
-    RequestError for requests that make no sense; infeasible ones are named with numbers in the status.
+    the curve is walked once. On a `ground` that is not flat feet stand on its levels and slopes. An `inbetweener` is
+    needed where the curve reverses. See `solve_shot` for the rest. RequestError for requests that make no sense;
+    infeasible ones are named with numbers in the status.
     """
     profile = SpeedProfile.constant(speed) if isinstance(speed, float | int) else speed
     return solve_shot(

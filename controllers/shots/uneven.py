@@ -3,7 +3,7 @@
 Each contact's foothold moves along the direction of travel by as little as the whole foot needs to stand on one plane,
 as a tread or a ramp: dynamic programming over all contacts, so that steps stay even. A swing foot takes the shortest
 curve over what is between two footholds, and is lifted where it would come too near. Hips follow the mean of what both
-feet stand on, and legs reach by inverse kinematics. On a flat floor nothing changes.
+feet stand on, and legs reach by inverse kinematics. On a flat floor hips and feet stay.
 """
 
 import math
@@ -49,6 +49,7 @@ _DEEPEST = 0.6  # metres of a tread that is taken in one step
 _BEFORE = 0.6  # metres before stairs, and after them, that are walked as slowly
 _EDGE_HEIGHT = 0.05  # metres of an edge of stairs
 _FACING, _STEP_SIGMA = 0.2, 0.03  # radians and metres by which hips and steps on stairs differ from path and treads
+_TOES_SHARE = 0.5  # of a foot from heel to ball, where a skeleton does not show how long its toes are
 _MARGIN, _HALF_WIDTH = 0.02, 0.04  # metres between a sole's ends and an edge, and of half a sole
 _MARGINS = ((-0.06, -0.03), (0.0, 0.0), (0.01, 0.01), (_MARGIN, _MARGIN))  # at heel and tip; a heel may stick out
 _FARTHEST, _GRID = 0.4, 0.01  # metres that a foothold is moved by at most, and between those that are tried
@@ -75,8 +76,9 @@ class Sole(NamedTuple):
         level = torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64)
         ball = level.new_tensor([0.0, -rest_height, 0.0])
         back = (find_heels(motion.skeleton)[foot] - motion.skeleton.offsets[CANONICAL.index(TOES[foot])]) * level
-        toes = level.new_tensor(motion.skeleton.end_offsets.get(TOES[foot], (0.0, 0.0, 0.0))) * level
-        return Sole(ball + back, ball, ball - torch.nn.functional.normalize(back, dim=0) * toes.norm())
+        end = motion.skeleton.end_offsets.get(TOES[foot])
+        toes = _TOES_SHARE * back.norm() if end is None else (level.new_tensor(end) * level).norm()
+        return Sole(ball + back, ball, ball - torch.nn.functional.normalize(back, dim=0) * toes)
 
     def points(
         self, toes: Float[Tensor, "frames 3"], turns: Float[Tensor, "frames 4"], up: Float[Tensor, "frames 4"]
@@ -87,8 +89,12 @@ class Sole(NamedTuple):
         own = rotations.rotate(rotations.inverse(up), straight - ball)
         level = own * own.new_tensor([1.0, 0.0, 1.0])
         level = torch.nn.functional.normalize(level, dim=-1) * own.norm(dim=-1, keepdim=True)
-        low = rotations.rotate(up, toes.new_tensor([0.0, self.ball[1], 0.0]).expand_as(toes)) + rotations.rotate(up, level)
-        return toes[:, None] + torch.stack([heel, 0.5 * (heel + ball), ball, torch.where(own[:, 1:2] < 0, low, straight)], dim=1)
+        low = rotations.rotate(up, toes.new_tensor([0.0, self.ball[1], 0.0]).expand_as(toes)) + rotations.rotate(
+            up, level
+        )
+        return toes[:, None] + torch.stack(
+            [heel, 0.5 * (heel + ball), ball, torch.where(own[:, 1:2] < 0, low, straight)], dim=1
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,13 +109,13 @@ class Foothold:
     """One past the last frame."""
     toe: Float[Tensor, "2"]
     """Toe joint over the flat floor, x and z, metres."""
-    moved: Float[Tensor, "2"] = torch.zeros(2, dtype=torch.float64)
+    moved: Float[Tensor, "2"]
     """By how much it is moved, metres."""
-    height: float = 0.0
+    height: float
     """Height of the plane below the toe joint, metres."""
-    gradient: Float[Tensor, "2"] = torch.zeros(2, dtype=torch.float64)
+    gradient: Float[Tensor, "2"]
     """Rise of the plane along x and along z."""
-    over_edge: bool = False
+    over_edge: bool
     """Whether the ground under the sole is not one plane."""
 
     @property
@@ -133,7 +139,7 @@ class Footing:
     steepest: float
     """Steepest slope that a foot stands on, radians."""
     highest: float
-    """Highest step from one foothold to the next."""
+    """Highest step from one foothold to the next, beyond the rise of a slope."""
     planted_share: float
     """Share of foot-frames that stand."""
     contact_speed: float
@@ -166,8 +172,8 @@ class Footing:
             )
         if self.highest > HIGHEST + 1e-6:
             found.append(
-                f"a step is {100 * self.highest:.0f} cm high: people climb otherwise from {100 * HIGHEST:.0f} cm on, and"
-                " the prior knows flat floors"
+                f"a step is {100 * self.highest:.0f} cm high: people climb otherwise from {100 * HIGHEST:.0f} cm on,"
+                " and the prior knows flat floors"
             )
         if self.over_edge:
             found.append(f"{self.over_edge} feet stand over an edge: no foothold near enough has room for a sole")
@@ -248,14 +254,17 @@ def _find_footholds(motion: Motion) -> list[Foothold]:
     toes = motion.joint_positions()[:, list(CANONICAL.indices(TOES))].double()
     planted = contacts.debounced(contacts.detect_contacts(toes, motion.fps))
     planted[[0, -1]] = True
+    still = toes.new_zeros(2)
     found = [
-        Foothold(foot, start, stop, toes[start:stop, foot, ::2].median(dim=0).values)
+        Foothold(foot, start, stop, toes[start:stop, foot, ::2].median(dim=0).values, still, 0.0, still, False)
         for foot, start, stop in true_intervals(planted)
     ]
     return sorted(found, key=lambda hold: hold.start)
 
 
-def _choose_footholds(holds: Sequence[Foothold], motion: Motion, ground: Ground, soles: Sequence[Sole]) -> list[Foothold]:
+def _choose_footholds(
+    holds: Sequence[Foothold], motion: Motion, ground: Ground, soles: Sequence[Sole]
+) -> list[Foothold]:
     """Move footholds along the direction of travel: the least sum of squares of how far each is moved, how much farther
     than the one before, how uneven the ground under its sole is, and how much too high it is (Viterbi 1967)."""
     hips = kinematics.heading(motion.local_quat_xyzw[:, 0].double())
@@ -270,10 +279,13 @@ def _choose_footholds(holds: Sequence[Foothold], motion: Motion, ground: Ground,
         found.append((moved, *_fit_planes(hold.toe + moved, yaw, ground, soles[hold.foot])))
     cost, came = torch.zeros_like(offsets), []
     between = ((offsets[:, None] - offsets) / _MOVED).square()
-    for number, (_, heights, _, uneven, _) in enumerate(found):
+    for number, (_, heights, gradients, uneven, _) in enumerate(found):
         if number:
-            rise = (heights - found[number - 1][1][:, None]).abs() - HIGHEST
-            cost, back = (cost[:, None] + between + (rise.clamp_min(0) / _TOO_HIGH).square()).min(dim=0)
+            _, before, slopes, _, _ = found[number - 1]
+            slope = torch.maximum(slopes.norm(dim=-1)[:, None], gradients.norm(dim=-1))
+            rise = (heights - before[:, None]).abs() - slope * (holds[number].toe - holds[number - 1].toe).norm()
+            high = ((rise - HIGHEST).clamp_min(0) / _TOO_HIGH).square()
+            cost, back = (cost[:, None] + between + high).min(dim=0)
             came.append(back)
         cost = cost + (offsets / _MOVED).square() + (uneven / _UNEVEN).square()
     at, chosen = int(cost.argmin()), []
@@ -460,7 +472,12 @@ def _lift_smoothly(need: Float[Tensor, " frames"]) -> Float[Tensor, " frames"]:
 
 
 def _measure(
-    done: Motion, motion: Motion, holds: Sequence[Foothold], ground: Ground, soles: Sequence[Sole], tracks: Sequence[_FootTrack]
+    done: Motion,
+    motion: Motion,
+    holds: Sequence[Foothold],
+    ground: Ground,
+    soles: Sequence[Sole],
+    tracks: Sequence[_FootTrack],
 ) -> Footing:
     """Measure how feet stand and swing."""
     toes, turns = (values.double() for values in (done.joint_positions(), done.joint_rotations()))
@@ -480,13 +497,17 @@ def _measure(
         passing = edge & (ground.height(swing[..., ::2]) > highest - EDGE / 2)
         if bool(passing.any()):
             clearance = min(clearance, float((swing[..., 1] - highest)[passing].min()))
-    ordered = [hold.height for hold in holds]
+    rises = [
+        abs(one.height - other.height)
+        - float(max(one.gradient.norm(), other.gradient.norm()) * (one.toe - other.toe).norm())
+        for one, other in pairwise(holds)
+    ]
     return Footing(
         clearance,
         depth,
         sum(hold.over_edge for hold in holds),
         math.atan(max(float(hold.gradient.norm()) for hold in holds)),
-        max((abs(other - one) for one, other in pairwise(ordered)), default=0.0),
+        max(0.0, *rises),
         float(torch.stack([track.standing for track in tracks]).double().mean()),
         float(torch.cat(speeds).mean()),
     )

@@ -83,6 +83,7 @@ def _run_scene(command: RunScene, path: Path, scene: SceneDescription, curves: S
                     folder=path.parent,
                     options=command,
                     obstacles=scene.obstacles,
+                    ground=scene.ground,
                 )
             )
         except RequestError as error:
@@ -148,8 +149,16 @@ def _write(
             for actor, done, character in zip(scene.actors, walks, drawn, strict=True)
         ]
         with outputs.show_progress("filming", quiet=command.quiet) as progress:
-            props = build_obstacles(walks)
-            film(shots, films, camera=scene.camera, size=scene.size, fps=scene.fps, props=props, progress=progress)
+            film(
+                shots,
+                films,
+                camera=scene.camera,
+                size=scene.size,
+                fps=scene.fps,
+                props=build_obstacles(walks),
+                ground=scene.ground,
+                progress=progress,
+            )
         notes = dict.fromkeys(note for shot in shots if shot.drawn is not None for note in shot.drawn.notes)
         if not command.quiet:
             print("".join(f"note      the character that is drawn: {note}\n" for note in notes), end="")
