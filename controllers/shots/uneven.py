@@ -49,8 +49,9 @@ _DEEPEST = 0.6  # metres of a tread that is taken in one step
 _BEFORE = 0.6  # metres before stairs, and after them, that are walked as slowly
 _EDGE_HEIGHT = 0.05  # metres of an edge of stairs
 _FACING, _STEP_SIGMA = 0.2, 0.03  # radians and metres by which hips and steps on stairs differ from path and treads
-_TOES_SHARE = 0.5  # of a foot from heel to ball, where a skeleton does not show how long its toes are
+_TOES_SHARE = 0.3  # of a foot from heel to ball, where a skeleton does not show how long its toes are
 _MARGIN, _HALF_WIDTH = 0.02, 0.04  # metres between a sole's ends and an edge, and of half a sole
+_LONGER = 0.4  # times that it counts if the ground is uneven under a longer sole than the shortest
 _MARGINS = ((-0.06, -0.03), (0.0, 0.0), (0.01, 0.01), (_MARGIN, _MARGIN))  # at heel and tip; a heel may stick out
 _FARTHEST, _GRID = 0.4, 0.01  # metres that a foothold is moved by at most, and between those that are tried
 _MOVED, _UNEVEN, _TOO_HIGH = 0.1, 0.004, 0.01  # metres that cost the same: moved, of a sole's rest, over HIGHEST
@@ -58,7 +59,7 @@ _HIPS_SECONDS, _HEADING_SECONDS = 0.15, 0.3  # over which hips follow the feet, 
 _BENDS_HERTZ = 4.0  # of a swing's trajectory
 _AHEAD = 0.15  # metres before a sole in which a riser is looked for
 _MOMENTS = 5  # from a frame to the next at which swing feet are measured
-_LIFT_ACCELERATION = 20.0  # m/s^2 with which a foot is lifted further at most
+_LIFT_ACCELERATION = 30.0  # m/s^2 with which a foot is lifted further at most
 
 
 class Sole(NamedTuple):
@@ -301,11 +302,11 @@ def _fit_planes(
     toes: Float[Tensor, "n 2"], yaw: Tensor, ground: Ground, sole: Sole
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 2"], Float[Tensor, " n"], Bool[Tensor, " n"]]:
     """Fit planes to the ground under soles with toe joints at points (x, z): heights below these, gradients along x and
-    z, and by how much the ground differs from the planes, metres: the mean of soles from a shorter to a longer one.
-    Also whether the sole itself is over an edge."""
+    z, and by how much the ground differs from the planes, metres: under the shortest sole, and less so under longer
+    ones. Also whether the sole itself is over an edge."""
     found = []
     for heel, tip in _MARGINS:
-        along = torch.stack([sole.heel[2] - heel, (sole.heel[2] + sole.tip[2]) / 2, sole.tip[2] + tip])
+        along = torch.linspace(float(sole.heel[2]) - heel, float(sole.tip[2]) + tip, 9, dtype=torch.float64)
         aside = along.new_tensor([-_HALF_WIDTH, 0.0, _HALF_WIDTH])
         under = rotations.rotate_ground(torch.cartesian_prod(aside, along), yaw)
         heights = ground.height(toes[:, None] + under)
@@ -315,7 +316,7 @@ def _fit_planes(
     planes, off, highest = (torch.stack(values) for values in zip(*found, strict=True))
     over = off > EDGE / 2  # over an edge a foot stands on what is higher under the shortest sole
     planes = torch.where(over[0, :, None], torch.nn.functional.pad(highest[0, :, None], (0, 2)), planes[0])
-    return planes[:, 0], planes[:, 1:], off.mean(dim=0), over[1]
+    return planes[:, 0], planes[:, 1:], off[0] + _LONGER * off[1:].mean(dim=0), over[1]
 
 
 @dataclass(frozen=True, eq=False)
