@@ -1,0 +1,165 @@
+"""Walks on ground that is not flat: feet stand on treads and slopes, swings clear edges, hips follow smoothly."""
+
+import json
+import math
+from itertools import pairwise
+
+import pytest
+from helpers import generator, run
+
+import controllers
+import priors
+from controllers.shots.request import Reach, ShotRequest
+from controllers.shots.uneven import Stairs, step_onto_ground
+from mapctl import curves
+from mapctl.errors import RequestError
+from mapctl.ground import Ground
+from mapctl.intent.path import SpeedProfile
+from mapctl.metrics.feet import locate_heels
+from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, TOES
+from scenes import overlays
+from scenes.stage import Shot, Stage
+
+RISE, TREAD, STEPS, KERB, FIRST = 0.17, 0.29, 4, 0.15, 2.6
+GROUND = f"""
+[[ramps]]
+start = [0, 0.6]
+end = [0, 1.8]
+heights = [0.0, 0.2]
+
+[[boxes]]
+centre = [0, 2.2]
+size = [2, 0.8]
+height = {0.2 + KERB}
+
+[[stairs]]
+start = [0, {FIRST}]
+steps = {STEPS}
+rise = {RISE}
+tread = {TREAD}
+base = {0.2 + KERB}
+
+[[boxes]]
+centre = [0, {FIRST + STEPS * TREAD + 2.0}]
+size = [2, 4]
+height = {0.2 + KERB + STEPS * RISE}
+"""
+
+
+def height_at(z):
+    """The ground along the path, by hand."""
+    if z < 0.6:
+        return 0.0
+    if z < 1.8:
+        return (z - 0.6) / 6
+    return 0.2 + KERB + RISE * min(STEPS, max(0, math.floor((z - FIRST) / TREAD) + 1))
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    found = tmp_path_factory.mktemp("ground") / "ground.toml"
+    found.write_text(GROUND)
+    return found
+
+
+@pytest.fixture(scope="module")
+def walked(path):
+    return controllers.follow(
+        priors.load("locomotion"), curves.line(length=5), ground=Ground.read(path), generator=generator(0)
+    )
+
+
+def test_planted_feet_stand_on_one_plane_of_the_ground(walked):
+    toes, heels = walked.motion.joint_positions()[:, list(CANONICAL.indices(TOES))], locate_heels(walked.motion)
+    standing = [
+        (one, other) for foot in range(2) for one, other in pairwise([s for s in walked.footsteps if s.foot == foot])
+    ]
+    assert len(standing) > 6
+    for one, other in standing:
+        middle = (one.land + other.lift) // 2
+        toe, heel = toes[middle, one.foot], heels[middle, one.foot]
+        ends = [float(heel[2]), float(toe[2]) + 0.07]
+        sloped = min(ends) > 0.6 and max(ends) < 1.8
+        assert float(toe[1]) - height_at(float(toe[2])) == pytest.approx(TOE_REST_HEIGHT, abs=0.02)
+        if not sloped:
+            assert height_at(ends[0]) == pytest.approx(height_at(ends[1]), abs=0.02), ends
+
+
+def test_each_step_of_the_stairs_is_one_tread(walked):
+    levels = [round((height_at(step.toe[1]) - 0.2 - KERB) / RISE, 3) for step in walked.footsteps if step.toe[1] > 2]
+    assert levels[-1] == STEPS
+    climbed = [level for level in levels if level > 0]
+    assert climbed[:STEPS] == list(range(1, STEPS + 1))
+
+
+def test_swing_feet_clear_edges_and_no_foot_is_in_the_ground(walked):
+    footing = walked.footing
+    assert footing.clearance > 0.02
+    assert footing.penetration < 0.01
+    assert footing.over_edge == 0
+    toes, heels = walked.motion.joint_positions()[:, list(CANONICAL.indices(TOES))], locate_heels(walked.motion)
+    for each, below in ((toes, TOE_REST_HEIGHT), (heels, TOE_REST_HEIGHT - 0.0201)):
+        over = [float(y) - below - height_at(float(z)) for _, y, z in each.reshape(-1, 3)]
+        assert min(over) > -0.02
+
+
+def test_hips_rise_with_the_ground_without_a_jolt(walked):
+    hips = walked.motion.root_position
+    assert float(hips[-1, 1] - hips[0, 1]) == pytest.approx(height_at(5.0), abs=0.05)
+    assert float(hips.diff(n=2, dim=0).norm(dim=-1).max()) * 900 < 12
+
+
+def test_a_flat_ground_changes_neither_feet_nor_hips(walk_motion):
+    done, footing, _ = step_onto_ground(walk_motion, Ground(), TOE_REST_HEIGHT)
+    kept = [0, *CANONICAL.indices(TOES)]
+    apart = (done.joint_positions() - walk_motion.joint_positions())[:, kept].norm(dim=-1)
+    assert float(apart.max()) < 0.002
+    assert footing.clearance == math.inf
+
+
+@pytest.fixture(scope="module")
+def walk_motion():
+    return controllers.follow(priors.load("locomotion"), curves.line(length=2), generator=generator(0)).motion
+
+
+def test_what_the_density_does_not_know_is_named(walk_motion, tmp_path):
+    steep = tmp_path / "steep.toml"
+    steep.write_text("[[ramps]]\nstart = [0, -1]\nend = [0, 3]\nheights = [0, 1.6]\nwidth = 9.0")
+    _, footing, _ = step_onto_ground(walk_motion, Ground.read(steep), TOE_REST_HEIGHT)
+    assert math.degrees(footing.steepest) == pytest.approx(math.degrees(math.atan(0.4)), abs=0.1)
+    assert len(footing.notes) == 1
+    assert "22 degrees" in footing.notes[0]
+
+
+def test_speeds_are_lower_on_stairs_alone(path):
+    line = curves.line(length=6)
+    slow = Stairs.find(line, Ground.read(path)).slow(SpeedProfile.constant(1.2), line, 0.54)
+    assert slow.at(FIRST + TREAD) == pytest.approx(TREAD / 0.5, abs=0.02)
+    assert slow.at(0.5) == slow.at(5.9) == 1.2
+
+
+def test_keys_on_a_ground_are_refused(path):
+    reach = Reach(1.0, {"leftHand": (0.3, 1.2, 1.0)})
+    with pytest.raises(RequestError, match="no keys"):
+        ShotRequest(curves.line(length=3), reaches=(reach,), ground=Ground.read(path))
+
+
+def test_the_command_reports_how_feet_stand(path, tmp_path, capsys):
+    out, report = tmp_path / "walk.bvh", tmp_path / "walk.json"
+    assert run("follow", "line:2", "-o", out, "--report", report, "--ground", path) == 0
+    assert "ground    swing" in capsys.readouterr().out
+    found = json.loads(report.read_text())
+    assert found["footing"]["penetration_max_cm"] < 1
+    assert found["footing"]["slope_max_deg"] == pytest.approx(math.degrees(math.atan(1 / 6)), abs=0.5)
+    path.with_name("bad.toml").write_text("[[boxes]]\ncentre = [0, 0]")
+    assert run("follow", "line:2", "-o", out, "--ground", path.with_name("bad.toml")) == 2
+
+
+def test_films_draw_the_ground_and_lay_trails_on_it(walk_motion, path):
+    ground = Ground.read(path)
+    tops = overlays.build_ground(ground).vertices[:, 1].max()
+    assert tops == pytest.approx(0.2 + KERB + STEPS * RISE)
+    trail = Stage([Shot(walk_motion)], ground=ground).compose_ghosts([0]).ground[1].vertices
+    raised = trail[:, 1] - [height_at(z) for z in trail[:, 2]]
+    assert trail[:, 1].max() > 0.1
+    assert raised == pytest.approx(overlays.TRAIL_HEIGHT, abs=1e-6)
