@@ -106,7 +106,7 @@ def test_swing_feet_clear_edges_and_no_foot_is_in_the_ground(walked):
 def test_hips_rise_with_the_ground_without_a_jolt(walked):
     hips = walked.motion.root_position
     assert float(hips[-1, 1] - hips[0, 1]) == pytest.approx(height_at(5.0), abs=0.05)
-    assert float(hips.diff(n=2, dim=0).norm(dim=-1).max()) * 900 < 12
+    assert float(hips.diff(n=2, dim=0)[:, 1].abs().max()) * 900 < 7  # m/s^2; 4 on a flat floor
 
 
 def test_a_flat_ground_changes_neither_feet_nor_hips(walk_motion):
