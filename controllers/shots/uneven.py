@@ -88,14 +88,10 @@ class Sole(NamedTuple):
         the slope (the rotation `up`) while the heel is raised."""
         heel, ball, straight = (rotations.rotate(turns, point.expand_as(toes)) for point in self)
         own = rotations.rotate(rotations.inverse(up), straight - ball)
-        level = own * own.new_tensor([1.0, 0.0, 1.0])
-        level = torch.nn.functional.normalize(level, dim=-1) * own.norm(dim=-1, keepdim=True)
-        low = rotations.rotate(up, toes.new_tensor([0.0, self.ball[1], 0.0]).expand_as(toes)) + rotations.rotate(
-            up, level
-        )
-        return toes[:, None] + torch.stack(
-            [heel, 0.5 * (heel + ball), ball, torch.where(own[:, 1:2] < 0, low, straight)], dim=1
-        )
+        ahead = torch.nn.functional.normalize(own * own.new_tensor([1.0, 0.0, 1.0]), dim=-1)
+        level = rotations.rotate(up, self.ball + ahead * own.norm(dim=-1, keepdim=True))
+        tip = torch.where(own[:, 1:2] < 0, level, straight)
+        return toes[:, None] + torch.stack([heel, 0.5 * (heel + ball), ball, tip], dim=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,10 +142,10 @@ class Footing:
     contact_speed: float
     """Mean speed of toes that stand, m/s."""
 
-    def as_row(self) -> dict[str, float]:
+    def as_row(self) -> dict[str, float | None]:
         """Return the row of a report, centimetres and degrees."""
         return {
-            "edge_clearance_min_cm": 100 * self.clearance,
+            "edge_clearance_min_cm": 100 * self.clearance if self.clearance < math.inf else None,
             "penetration_max_cm": 100 * self.penetration,
             "feet_over_edge": self.over_edge,
             "slope_max_deg": math.degrees(self.steepest),
@@ -164,17 +160,17 @@ class Footing:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences about what the density, which is of flat floors, does not know."""
+        """Sentences about what leaves the data of the density, which are of flat floors."""
         found = []
         if self.steepest > STEEPEST + 1e-6:
             found.append(
                 f"the ground slopes by {math.degrees(self.steepest):.0f} degrees where a foot stands: people walk"
-                f" otherwise from {math.degrees(STEEPEST):.0f} on, and the prior knows flat floors"
+                f" otherwise from {math.degrees(STEEPEST):.0f} on, and the prior's data are of flat floors"
             )
         if self.highest > HIGHEST + 1e-6:
             found.append(
                 f"a step is {100 * self.highest:.0f} cm high: people climb otherwise from {100 * HIGHEST:.0f} cm on,"
-                " and the prior knows flat floors"
+                " and the prior's data are of flat floors"
             )
         if self.over_edge:
             found.append(f"{self.over_edge} feet stand over an edge: no foothold near enough has room for a sole")
@@ -324,7 +320,7 @@ class _FootTrack:
     """What is added to a foot's motion over the flat floor, by frame."""
 
     base: Float[Tensor, "frames 3"]
-    """Point below the toe joint on the ground or on the way over it, world, metres."""
+    """Point below the toe joint on the ground or on the trajectory over it, world, metres."""
     up: Float[Tensor, "frames 4"]
     """Rotation from the floor to the slope."""
     moved: Float[Tensor, "frames 2"]
@@ -366,8 +362,7 @@ class _FootTrack:
         standing = torch.ones(frames, dtype=torch.bool)
         for start, stop in swings:
             standing[start:stop] = False
-        bent = smooth_between(bent, standing, hertz=_BENDS_HERTZ, fps=PRIOR_FPS)
-        base = bent + back
+        base = smooth_between(bent, standing, hertz=_BENDS_HERTZ, fps=PRIOR_FPS) + back
         base[:, ::2] += flat + moved
         base[:, 1] += height[:, 0]
         return _FootTrack(base, up, moved, height[:, 0], toe[:, 1], swings, standing)
