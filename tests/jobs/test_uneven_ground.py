@@ -10,6 +10,7 @@ from helpers import generator, run
 import controllers
 import priors
 from controllers.shots.request import Reach, ShotRequest
+from controllers.shots.trajectory import plan_trajectory
 from controllers.shots.uneven import Stairs, step_onto_ground
 from mapctl import curves
 from mapctl.errors import RequestError
@@ -136,6 +137,16 @@ def test_speeds_are_lower_on_stairs_alone(path):
     slow = Stairs.find(line, Ground.read(path)).slow(SpeedProfile.constant(1.2), line, 0.54)
     assert slow.at(FIRST + TREAD) == pytest.approx(TREAD / 0.5, abs=0.02)
     assert slow.at(0.5) == slow.at(5.9) == 1.2
+
+
+def test_terms_of_stairs_hold_on_them_alone(path):
+    trajectory = plan_trajectory(ShotRequest(curves.line(length=6), SpeedProfile.constant(0.6)))
+    stairs = Stairs.find(trajectory.curve, Ground.read(path))
+    facing, steps = stairs.terms(trajectory, 30 * 5, 34)  # 3 m along
+    assert (facing.name, steps.name) == ("facing", "steps")
+    assert steps.length == pytest.approx(TREAD, abs=0.01)
+    assert len(facing.facing) == 34
+    assert stairs.terms(trajectory, 0, 34) == Stairs.find(trajectory.curve, None).terms(trajectory, 150, 34) == ()
 
 
 def test_keys_on_a_ground_are_refused(path):
