@@ -145,13 +145,16 @@ class Conversion:
         if command.robot is None and command.header:
             raise RequestError("--header is for the .csv of a robot; name one by --robot")
         robot = None if command.robot is None else robot_model.load(command.robot)
-        return Conversion(command, fps, fps_in, inputs.read_rig(command.source_rig, command), body, robot)
+        found = Conversion(command, fps, fps_in, inputs.read_rig(command.source_rig, command), body, robot)
+        if robot is not None and not found.to_robot and command.source.suffix.lower() != ".csv":
+            raise RequestError("--robot is for a robot's motion; name OUT .csv or .npz (--to of a folder), or IN .csv")
+        return found
 
     @property
     def to_robot(self) -> bool:
         """Whether the results are a robot's."""
         ending = f".{(self.command.to or self.command.out.suffix).lower().removeprefix('.')}"
-        return self.robot is not None and ending in robot_files.ENDINGS
+        return self.robot is not None and self.command.as_ is None and ending in robot_files.ENDINGS
 
     def convert(self, source: Path) -> Converted:
         command, rig, notes = self.command, self.source_rig, list[str]()

@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mapctl import contacts, rotations
+from mapctl import rotations
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.formats.atomic import write_bytes
 from mapctl.formats.text import LARGEST_VALUE, read_bytes
@@ -54,40 +54,40 @@ def build_rows(motion: RobotMotion) -> Float[Tensor, "frames columns"]:
 
 
 def _collect_arrays(motion: RobotMotion) -> dict[str, np.ndarray]:
-    fps, bodies = float(motion.fps), motion.robot.bodies
+    bodies = motion.robot.bodies
     at, world = (values[:, bodies] for values in motion.chain_links())
-    steps = rotations.to_rotation_vector(rotations.from_matrix(world[1:] @ world[:-1].mT))
+    frames = torch.arange(len(at))
+    before, after = (frames - 1).clamp_min(0), (frames + 1).clamp_max(len(at) - 1)
+    rate = float(motion.fps) / (after - before).clamp_min(1)[:, None].double()  # central differences
+    turned = rotations.to_rotation_vector(rotations.from_matrix(world[after] @ world[before].mT))
     quats = rotations.make_sign_continuous(rotations.from_matrix(world @ motion.robot.zero[bodies]))
-    spinning = torch.cat([steps, steps[-1:]]) if len(steps) else torch.zeros_like(at)
     return {
-        "fps": np.array([fps]),
+        "fps": np.array([float(motion.fps)]),
         "joint_names": np.array(motion.robot.joints),
         "joint_pos": motion.angles.numpy(),
-        "joint_vel": _differentiate(motion.angles, fps).numpy(),
+        "joint_vel": (rate * (motion.angles[after] - motion.angles[before])).numpy(),
         "body_names": np.array([motion.robot.skeleton.names[body] for body in bodies]),
         "body_pos_w": at.numpy(),
         "body_quat_w": quats.roll(1, dims=-1).numpy(),
-        "body_lin_vel_w": _differentiate(at, fps).numpy(),
-        "body_ang_vel_w": (fps * spinning).numpy(),
+        "body_lin_vel_w": (rate[..., None] * (at[after] - at[before])).numpy(),
+        "body_ang_vel_w": (rate[..., None] * turned).numpy(),
         "contacts": motion.contacts.numpy(),
     }
-
-
-def _differentiate(values: Float[Tensor, "frames *width"], fps: float) -> Float[Tensor, "frames *width"]:
-    return torch.gradient(values, spacing=1 / fps, dim=0)[0] if len(values) > 1 else torch.zeros_like(values)
 
 
 def load_csv(path: str | PathLike[str], robot: Robot, fps: Fraction) -> RobotMotion:
     """Load a CSV; feet stand where the tips of their soles are low and slow. FileFormatError for one that is not of
     this robot."""
     lines = read_bytes(path).decode("utf-8", errors="replace").strip().splitlines()
-    named = bool(lines) and any(word in lines[0] for word in ("x", "joint"))
+    named = any(word in lines[0] for word in ("x", "joint"))
+    if len(lines) == named:
+        raise FileFormatError(path, "has no frames")
     try:
         rows = np.loadtxt(lines[named:], delimiter=",", ndmin=2, dtype=np.float64)
     except ValueError as error:
         raise FileFormatError(path, "is no table of numbers with commas between them") from error
     width = len(_BASE) + len(robot.joints)
-    if rows.shape[1] != width or not len(rows):
+    if rows.shape[1] != width:
         raise FileFormatError(path, f"has {rows.shape[1]} columns, expected 7 of the base and {width - 7} joints")
     if named and (joints := tuple(lines[0].strip().split(",")[7:])) != robot.joints:
         strange = next((name for name in joints if name not in robot.joints), "their order")
@@ -98,7 +98,4 @@ def load_csv(path: str | PathLike[str], robot: Robot, fps: Fraction) -> RobotMot
     values = torch.from_numpy(rows)
     orientation = rotations.to_matrix(torch.nn.functional.normalize(values[:, 3:7], dim=1)) @ robot.zero[0].mT
     stand = torch.zeros(len(values), 2, dtype=torch.bool)
-    found = RobotMotion(robot, fps, values[:, :3], orientation, values[:, 7:], stand)
-    tips = torch.stack([corners[..., 2:, :].mean(dim=1) for corners in found.find_soles()], dim=1)
-    upright = torch.stack([tips[..., 1], tips[..., 2], tips[..., 0]], dim=-1)
-    return RobotMotion(robot, fps, values[:, :3], orientation, values[:, 7:], contacts.detect_contacts(upright, fps))
+    return RobotMotion(robot, fps, values[:, :3], orientation, values[:, 7:], stand).detect_contacts()

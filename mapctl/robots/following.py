@@ -40,7 +40,8 @@ class RobotFollower:
         DELAY_FRAMES before, or fewer at the beginning, None while there is none."""
         frames = Motion(self._skeleton, Fraction(PRIOR_FPS), root.double(), quats.double())
         given = frames if self._given is None else self._given.join(frames)
-        given = self._given = given.slice(max(0, given.num_frames - _MEMORY), given.num_frames)
+        memory = max(_MEMORY, len(root) + DELAY_FRAMES + _HELD)
+        given = self._given = given.slice(max(0, given.num_frames - memory), given.num_frames)
         self._total += len(root)
         offset, stop = self._total - given.num_frames, self._total - DELAY_FRAMES
         if stop <= self._shown:
@@ -63,12 +64,12 @@ class RobotFollower:
 
 def _keep_footholds(seen: Observations, shown: RobotMotion, held: int) -> Observations:
     """Keep feet that stand in the last frame that is held, and stood when it was shown, until they are lifted."""
-    at, world = shown.chain_links()
+    tips, (_, world) = shown.find_tips(), shown.chain_links()
     positions, orientations = seen.positions.clone(), seen.orientations.clone()
     for side, number in enumerate(seen.tips):
         stays = seen.standing[held - 1 :, side].cumprod(dim=0).bool() & shown.contacts[0, side]
         link, frames = seen.links[number], held - 1 + stays.nonzero()[:, 0]
-        positions[frames, number, :2] = (at[0, link] + world[0, link] @ seen.points[number])[:2]
+        positions[frames, number, :2] = tips[0, side, :2]
         if seen.orientation_weights[held - 1, number] == seen.orientation_weights[:, number].amax():
             orientations[frames, number] = world[0, link]
     return replace(seen, positions=positions, orientations=orientations)

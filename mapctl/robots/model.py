@@ -17,7 +17,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import torch
-from annotated_types import Gt
+from annotated_types import Gt, MinLen
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -25,6 +25,7 @@ from mapctl import kinematics, rotations
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.formats import toml
 from mapctl.formats.text import one_line
+from mapctl.joint_names import Side, split_side
 from mapctl.mesh.primitives import unit
 from mapctl.retarget import RigMap, identify_rig
 from mapctl.retarget.character import RiggedCharacter, Stance
@@ -46,7 +47,7 @@ class _Stated:
     """Link by canonical joint, where another one would be recognised."""
     speed: Annotated[float, Gt(0)] | None = None
     """Largest speed of all joints, rad/s."""
-    soles: Mapping[str, Sequence[Sequence[float]]] = field(default_factory=dict)
+    soles: Mapping[str, Annotated[Sequence[tuple[float, float, float]], MinLen(3)]] = field(default_factory=dict)
     """Corners of the soles by foot link, each x, y and z in the link's frame in the model, metres."""
 
 
@@ -95,19 +96,25 @@ class Robot:
         return found
 
     @property
+    def feet(self) -> tuple[int, int]:
+        """The left and the right foot's link."""
+        return self.rigmap.joints["leftFoot"], self.rigmap.joints["rightFoot"]
+
+    @property
+    def tips(self) -> Float[Tensor, "2 3"]:
+        """Tips of the left and the right sole about the origins of their links, metres."""
+        names, ends = self.skeleton.names, self.skeleton.end_offsets
+        return torch.tensor([ends[names[foot]] for foot in self.feet], dtype=torch.float64)
+
+    @property
     def corner_links(self) -> list[int]:
         """The link of each corner of the soles."""
-        feet = (self.rigmap.joints[f"{side}Foot"] for side in ("left", "right"))
-        return [foot for foot, sole in zip(feet, self.soles, strict=True) for _ in sole]
+        return [foot for foot, sole in zip(self.feet, self.soles, strict=True) for _ in sole]
 
     @property
     def bodies(self) -> list[int]:
         """The links that are bodies of the model."""
         return [link for link, name in enumerate(self.skeleton.names) if not name.startswith("(")]
-
-    def find_link(self, joint: str) -> int | None:
-        """Find the link that is a canonical joint, None if there is none."""
-        return self.rigmap.joints.get(joint)
 
     def rotate_links(
         self, base: Float[Tensor, "frames 3 3"], angles: Float[Tensor, "frames joints"]
@@ -172,9 +179,7 @@ class _Tree:
     def __init__(self, path: Path, model: Any):
         mujoco = import_mujoco()
         self.path, self.model, self.data = path, model, mujoco.MjData(model)
-        free = [int(model.jnt_qposadr[j]) for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE]
-        self.data.qpos[:] = 0
-        self.data.qpos[[first + 3 for first in free]] = 1
+        self.data.qpos[model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]] = 0
         mujoco.mj_kinematics(model, self.data)
         self.names: list[str] = []
         self.parents: list[int] = []
@@ -193,10 +198,12 @@ class _Tree:
             if any(model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE for j in own) or (own and above < 0):
                 raise FileFormatError(path, f"{model.body(body).name}: only hinges are known below a free base")
             for joint in own[:-1]:
-                above = self._add(model.joint(joint).name, above, body, joint)
+                above = self._add(_name_joint(model, joint), above, body, joint)
             self.link_of[body] = self._add(model.body(body).name or f"body{body}", above, body, *own[-1:])
         if not self.names:
             raise FileFormatError(path, "has no bodies")
+        self.turn = self._find_turn()
+        self.origins, self.zero = [self.turn @ at for at in self.origins], [self.turn @ zero for zero in self.zero]
 
     def _add(self, name: str, above: int, body: int, joint: int | None = None) -> int:
         self.names.append(name)
@@ -211,7 +218,7 @@ class _Tree:
     def build(self, stated: _Stated) -> Robot:
         """Build the robot; FileFormatError where a part of a person is not among its links."""
         links = self._match_links() | dict(stated.links)
-        for joint in REQUIRED:
+        for joint in (*REQUIRED, *links):
             if links.get(joint) not in self.names:
                 beside = self.path.with_suffix(".toml").name
                 raise FileFormatError(self.path, f"no link is known to be {joint}; name it under [links] in {beside}")
@@ -222,7 +229,7 @@ class _Tree:
         tips = [np.array([sole[:, 0].max(), sole[:, 1].mean(), sole[:, 2].min()]) for sole in soles]
         ends = {foot: (float(tip[0]), float(tip[1]), float(tip[2])) for foot, tip in zip(feet, tips, strict=True)}
         skeleton = Skeleton(tuple(self.names), tuple(self.parents), torch.from_numpy(offsets), ends)
-        joints = [model.joint(joint).name for joint in self.turning]
+        joints = [_name_joint(model, joint) for joint in self.turning]
         limited = model.jnt_limited[self.turning].astype(bool)[:, None]
         ranges = torch.from_numpy(np.where(limited, model.jnt_range[self.turning], [-np.pi, np.pi]))
         speeds = {} if stated.speed is not None else _read_speeds(self.path)
@@ -232,7 +239,7 @@ class _Tree:
             skeleton=skeleton,
             joints=tuple(joints),
             hinges=tuple(self.hinges),
-            axes=torch.from_numpy(self.data.xaxis[self.turning]),
+            axes=torch.from_numpy(self.data.xaxis[self.turning] @ self.turn.T),
             low=ranges[:, 0],
             high=ranges[:, 1],
             speed=torch.tensor(speed, dtype=torch.float64),
@@ -247,12 +254,12 @@ class _Tree:
         link = self.names.index(foot)
         if foot in stated.soles:
             return np.array(stated.soles[foot], dtype=np.float64).reshape(-1, 3) @ self.zero[link].T
-        model, data, points = self.model, self.data, []
+        model, data, points = self.model, self.data, list[np.ndarray]()
         bodies = {body for body, own in self.link_of.items() if self._find_moving(own) == link}
         for geom in (geom for geom in range(model.ngeom) if int(model.geom_bodyid[geom]) in bodies):
             signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
             box = model.geom_aabb[geom, :3] + signs * model.geom_aabb[geom, 3:]
-            points.append(data.geom_xpos[geom] + box @ data.geom_xmat[geom].reshape(3, 3).T)
+            points.append((data.geom_xpos[geom] + box @ data.geom_xmat[geom].reshape(3, 3).T) @ self.turn.T)
         if not points:
             beside = self.path.with_suffix(".toml").name
             raise FileFormatError(
@@ -260,6 +267,20 @@ class _Tree:
             )
         low, high = (edge(np.concatenate(points), axis=0) - self.origins[link] for edge in (np.min, np.max))
         return np.array([(x, y, low[2]) for x in (low[0], high[0]) for y in (low[1], high[1])])
+
+    def _find_turn(self) -> Float[np.ndarray, "3 3"]:
+        """Find the rotation about the vertical after which links that are named left are on the left, X ahead: a model
+        may stand in any heading. Without such names it faces X."""
+        sides = [
+            [at for at, name in zip(self.origins, self.names, strict=True) if split_side(name)[0] is side]
+            for side in (Side.LEFT, Side.RIGHT)
+        ]
+        if not all(sides):
+            return np.eye(3)
+        left, right = (np.mean(side, axis=0) for side in sides)
+        x, y, _ = left - right
+        cos, sin = np.array([y, x]) / (np.hypot(x, y) or 1.0)
+        return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
     def _find_moving(self, link: int) -> int:
         """Find the link that carries a link: itself if it turns."""
@@ -335,7 +356,7 @@ class _Tree:
         return max(fixed, key=lambda own: float(np.linalg.norm(self.origins[own] - self.origins[link])))
 
     def _axis(self, link: int) -> Float[np.ndarray, "3"]:
-        return self.data.xaxis[self.turning[self.hinges.index(link)]]
+        return self.turn @ self.data.xaxis[self.turning[self.hinges.index(link)]]
 
     def _find_centre(self, links: list[int]) -> int:
         """Find the link that is nearest to the point where the axes of several about meet, by least squares."""
@@ -346,11 +367,15 @@ class _Tree:
         return links[int(np.linalg.norm(at - centre, axis=1).argmin())]
 
 
+def _name_joint(model: Any, joint: int) -> str:
+    return model.joint(joint).name or f"joint{joint}"
+
+
 def _read_speeds(path: Path) -> dict[str, float]:
     """Read the largest speeds of a URDF's joints, rad/s, which MuJoCo leaves out."""
-    found = {}
-    for joint in ElementTree.parse(path).iter("joint"):
-        limit = joint.find("limit")
-        if limit is not None and float(limit.get("velocity", 0)) > 0:
-            found[joint.get("name", "")] = float(limit.get("velocity", 0))
-    return found
+    try:
+        joints = [(joint.get("name", ""), joint.find("limit")) for joint in ElementTree.parse(path).iter("joint")]
+        found = {name: float(limit.get("velocity", 0)) for name, limit in joints if limit is not None}
+    except (ElementTree.ParseError, ValueError) as error:
+        raise FileFormatError(path, f"velocity of joints: {one_line(error)}") from error
+    return {name: speed for name, speed in found.items() if speed > 0}

@@ -45,8 +45,7 @@ class Second:
 def assess(motion: RobotMotion) -> list[Second]:
     """Assess each second of a motion."""
     robot, fps = motion.robot, float(motion.fps)
-    soles = motion.find_soles()
-    tips = torch.stack([sole[:, 2:].mean(dim=1) for sole in soles], dim=1)
+    tips, corners = motion.find_tips(), motion.find_points(robot.corner_links, torch.cat(robot.soles))
     speed, acceleration = (_pad(motion.angles.diff(n=n, dim=0).abs() * fps**n, n) for n in (1, 2))
     stays = motion.contacts[1:] & motion.contacts[:-1]
     slide = _pad(torch.where(stays, tips.diff(dim=0).norm(dim=-1) * fps, 0.0), 1)
@@ -58,12 +57,12 @@ def assess(motion: RobotMotion) -> list[Second]:
         "speed_share": (speed / robot.speed).amax(dim=1),
         "acceleration_rad_s2": acceleration.amax(dim=1),
         "self_contact_cm": 100 * depth,
-        "balance_cm": 100 * _measure_balance(motion, soles, centre),
+        "balance_cm": 100 * _measure_balance(motion, corners, centre),
         "slide_cm_s": 100 * slide.amax(dim=1),
-        "sole_low_cm": -100 * torch.cat(soles, dim=1)[..., 2].amin(dim=1),
+        "sole_low_cm": -100 * corners[..., 2].amin(dim=1),
         "sole_high_cm": 100 * torch.where(motion.contacts, tips[..., 2], 0.0).amax(dim=1),
     }
-    found, size = [], round(fps)
+    found, size = [], max(1, round(fps))
     for start in range(0, len(motion.angles), size):
         worst = {name: float(values[start : start + size].max()) for name, values in by_frame.items()}
         found.append(Second(start / fps, **worst | {"sole_low_cm": -worst["sole_low_cm"]}))
@@ -86,7 +85,8 @@ def _measure_bodies(motion: RobotMotion) -> tuple[Float[Tensor, " frames"], Floa
     """Measure how deep links are in each other, and the centre of mass, metres."""
     mujoco, model = import_mujoco(), motion.robot.model
     data: Any = mujoco.MjData(model)
-    addresses = [int(model.joint(name).qposadr[0]) for name in motion.robot.joints]
+    hinges = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
+    addresses = model.jnt_qposadr[hinges][: len(motion.robot.joints)]  # those of objects come after
     base = int(next(body for body in range(1, model.nbody) if model.body_parentid[body] == 0))
     depth, centre = torch.zeros(len(motion.angles)).double(), torch.zeros(len(motion.angles), 3).double()
     data.qpos[:] = model.qpos0
@@ -104,13 +104,14 @@ def _measure_bodies(motion: RobotMotion) -> tuple[Float[Tensor, " frames"], Floa
 
 
 def _measure_balance(
-    motion: RobotMotion, soles: tuple[Float[Tensor, "frames corners 3"], ...], centre: Float[Tensor, "frames 3"]
+    motion: RobotMotion, corners: Float[Tensor, "frames corners 3"], centre: Float[Tensor, "frames 3"]
 ) -> Float[Tensor, " frames"]:
     """Measure how far the centre of mass is outside what standing soles span, metres."""
     found = torch.zeros(len(centre), dtype=torch.float64)
-    for frame, stands in enumerate(motion.contacts):
-        corners = [sole[frame, :, :2] for sole, foot in zip(soles, stands, strict=True) if foot]
-        if corners:
-            hull = ConvexHull(torch.cat(corners).numpy(), qhull_options="QJ").equations
+    left, right = (len(sole) for sole in motion.robot.soles)
+    standing = motion.contacts.repeat_interleave(torch.tensor([left, right]), dim=1)
+    for frame, stands in enumerate(standing):
+        if stands.any():
+            hull = ConvexHull(corners[frame, stands, :2].numpy(), qhull_options="QJ").equations
             found[frame] = max(0.0, float(np.max(hull[:, :2] @ centre[frame, :2].numpy() + hull[:, 2])))
     return found

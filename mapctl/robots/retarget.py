@@ -12,7 +12,7 @@ Newton, Bertsekas 1982). Speeds beyond a joint's are penalised, and what is left
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
@@ -22,9 +22,10 @@ from jaxtyping import Bool, Float
 from scipy.linalg import solveh_banded
 from torch import Tensor
 
-from mapctl import rotations
+from mapctl import contacts, rotations
 from mapctl.kinematics.moving import rotate_world
 from mapctl.motion import Motion
+from mapctl.retarget import as_rig, load_rig, to_canonical
 from mapctl.retarget.carry import Changes, find_ground, retarget_motion
 from mapctl.retarget.character import FEET, TOES
 from mapctl.retarget.hands import Spans
@@ -78,20 +79,35 @@ class RobotMotion:
         quats = rotations.make_sign_continuous(rotations.from_matrix(local))
         return rotate_world(Motion(self.robot.skeleton, self.fps, self.position, quats), rotations.inverse(_TO_ROBOT))
 
+    @staticmethod
+    def of(motion: Motion, robot: Robot) -> "RobotMotion | None":
+        """Return a motion of the robot's own links, Y up, as `to_motion` has it; None if its hinges do not allow it."""
+        own = rotate_world(motion, _TO_ROBOT)
+        local = rotations.to_matrix(own.local_quat_xyzw)
+        turned = rotations.to_rotation_vector(own.local_quat_xyzw[:, list(robot.hinges)])
+        angles, stand = (turned * robot.axes).sum(dim=-1), torch.zeros(own.num_frames, 2, dtype=torch.bool)
+        if not torch.allclose(robot.rotate_links(local[:, 0], angles), local, atol=1e-6):
+            return None
+        return RobotMotion(robot, motion.fps, own.root_position, local[:, 0], angles, stand).detect_contacts()
+
     def chain_links(self) -> tuple[Float[Tensor, "frames links 3"], Float[Tensor, "frames links 3 3"]]:
         """Compute positions of all links in the world, metres, and their orientations."""
         at, world = self.robot.chain_links(self.orientation, self.angles)
         return at + self.position[:, None], world
 
-    def find_soles(self) -> tuple[Float[Tensor, "frames corners 3"], Float[Tensor, "frames corners 3"]]:
-        """Find the corners of the left and the right sole, metres; the second half are those ahead."""
+    def find_points(self, links: Sequence[int], points: Float[Tensor, "points 3"]) -> Float[Tensor, "frames points 3"]:
+        """Find points that are fixed to links, given about the links' origins, metres."""
         at, world = self.chain_links()
-        links = [self.robot.find_link(f"{side}Foot") for side in ("left", "right")]
-        left, right = (
-            at[:, link, None] + (world[:, link, None] @ sole[..., None])[..., 0]
-            for link, sole in zip(links, self.robot.soles, strict=True)
-        )
-        return left, right
+        return at[:, links] + (world[:, links] @ points[..., None])[..., 0]
+
+    def find_tips(self) -> Float[Tensor, "frames 2 3"]:
+        """Find the tips of the left and the right sole, metres."""
+        return self.find_points(self.robot.feet, self.robot.tips)
+
+    def detect_contacts(self) -> "RobotMotion":
+        """Return the motion with feet that stand where the tips of their soles are low and slow."""
+        upright = self.find_tips()[..., [1, 2, 0]]
+        return replace(self, contacts=contacts.detect_contacts(upright, self.fps))
 
 
 _TRACKS = ("position", "orientation", "angles", "contacts")
@@ -123,7 +139,12 @@ class Observations:
 
 def retarget_to_robot(motion: Motion, robot: Robot, rig: Rig | None = None) -> tuple[RobotMotion, Changes]:
     """Find the angles with which a robot moves as a person does, at the motion's frame rate; also return how the motion
-    changed for the robot's bones. `rig` is the motion's, where it is not the one that would be recognised."""
+    changed for the robot's bones. `rig` is the motion's, where it is not the one that would be recognised. A motion of
+    the robot's own links, Y up, is returned as it is."""
+    if motion.skeleton.matches(robot.skeleton):
+        if (own := RobotMotion.of(motion, robot)) is not None:
+            return own, Changes()
+        motion, rig = to_canonical(motion, replace(as_rig(robot.rigmap), up="y"))[0], load_rig("canonical")
     carried = retarget_motion(motion, robot.character, rig)
     seen = observe(carried.motion, robot)
     done, stop = None, 0
@@ -139,58 +160,49 @@ def retarget_to_robot(motion: Motion, robot: Robot, rig: Rig | None = None) -> t
     return _cut_speeds(done), carried.changes
 
 
-def observe(own: Motion, robot: Robot) -> "Observations":
+def observe(own: Motion, robot: Robot) -> Observations:
     """Observe links in a motion on the robot's bones, canonical joints, Y up."""
-    found = list(_observe_joints(own, robot))
-    links, points, *tracks, standing = zip(*found, strict=True)
-    positions, position_weights, orientations, orientation_weights = (torch.stack(track, dim=1) for track in tracks)
-    feet = torch.stack([stands for stands in standing if stands is not None], dim=1)
-    return Observations(
-        list(links), torch.stack(points), positions, position_weights, orientations, orientation_weights, feet
-    )
-
-
-def _observe_joints(
-    own: Motion, robot: Robot
-) -> Iterator[tuple[int, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None]]:
-    """Yield link, point, positions and weights, orientations and weights of each observed point; with the tip of a sole
-    the frames in which it stands."""
-    rigmap, frames = robot.rigmap, own.num_frames
-    down = _TO_ROBOT.expand(frames, CANONICAL.num_joints, 4)
+    joints, tpose = robot.rigmap.joints, robot.rigmap.tpose_quat_xyzw
+    trunk = next(name for name in ("chest", "spine", "hips") if name in joints)
+    down = _TO_ROBOT.expand(own.num_frames, CANONICAL.num_joints, 4)
     turned, at = own.joint_rotations(), rotations.rotate(down, own.joint_positions())
     spans, raised = find_ground(own, robot.character.stance)
-    origin, nothing = torch.zeros(3, dtype=torch.float64), torch.zeros(frames, dtype=torch.float64)
+    feet = [_Foot.of(own, robot, side, spans[side]) for side in (0, 1)]
+    origin = torch.zeros(3, dtype=torch.float64)
+    rows: list[tuple[int, Tensor, Tensor, Tensor, Tensor, Tensor]] = []
     for joint, name in enumerate(CANONICAL.names):
+        frame = trunk if name == "chest" else name
         part = name.removeprefix("left").removeprefix("right")
         errors = [table.get(part, math.inf) for table in (_POSITION_ERRORS, _ORIENTATION_ERRORS)]
-        link = robot.find_link(name)
-        if link is None or errors == [math.inf, math.inf] or (name == "head" and not _turns(robot, link)):
+        link = joints.get(frame)
+        fixed = name == "head" and link is not None and not (robot.above[link] & ~robot.above[joints[trunk]]).any()
+        if link is None or errors == [math.inf, math.inf] or fixed:
             continue
-        weight, turn_weight = (torch.full((frames,), error**-2, dtype=torch.float64) for error in errors)
-
-        def orient(quats: Tensor, tpose: Tensor = rigmap.tpose_quat_xyzw[joint]) -> Tensor:
-            return rotations.to_matrix(
-                rotations.multiply(down[:, 0], rotations.multiply(quats, tpose.expand(frames, 4)))
-            )
-
-        orientation, moved = orient(turned[:, joint]), origin
+        weight, turn_weight = (torch.full((own.num_frames,), error**-2, dtype=torch.float64) for error in errors)
+        orientation, moved = _orient(turned[:, joint], tpose[CANONICAL.names.index(frame)]), origin
         if part == "Foot":
             side = FEET.index(joint)
-            foot = _Foot.of(own, robot, side, spans[side])
-            orientation = torch.where(foot.flat[:, None, None], orient(rotations.about_y(foot.heading)), orientation)
+            foot, flatly = feet[side], _orient(rotations.about_y(feet[side].heading), tpose[joint])
+            orientation = torch.where(foot.flat[:, None, None], flatly, orientation)
             turn_weight = torch.where(foot.flat, _FLAT_ERROR**-2, turn_weight)
             moved = foot.hold(at[:, TOES[side]], raised[:, side])
             tip_weight = torch.where(foot.stands, _STANDING_ERROR**-2, weight)
-            end = torch.tensor(robot.skeleton.end_offsets[robot.skeleton.names[link]], dtype=torch.float64)
-            yield link, end, at[:, TOES[side]] + moved, tip_weight, orientation, turn_weight, foot.stands
-            weight, turn_weight = torch.where(foot.stands, 0.0, weight), nothing
-        yield link, origin, at[:, joint] + moved, weight, orientation, turn_weight, None
+            rows.append((link, robot.tips[side], at[:, TOES[side]] + moved, tip_weight, orientation, turn_weight))
+            weight, turn_weight = torch.where(foot.stands, 0.0, weight), torch.zeros_like(turn_weight)
+        rows.append((link, origin, at[:, joint] + moved, weight, orientation, turn_weight))
+    links, points, *tracks = zip(*rows, strict=True)
+    positions, position_weights, orientations, orientation_weights = (torch.stack(track, dim=1) for track in tracks)
+    standing = torch.stack([foot.stands for foot in feet], dim=1)
+    return Observations(
+        list(links), torch.stack(points), positions, position_weights, orientations, orientation_weights, standing
+    )
 
 
-def _turns(robot: Robot, head: int) -> bool:
-    """Return whether a joint turns the head that does not turn the trunk."""
-    trunk = robot.find_link("chest") or robot.find_link("spine") or 0
-    return bool((robot.above[head] & ~robot.above[trunk]).any())
+def _orient(quats: Float[Tensor, "frames 4"], tpose: Float[Tensor, "4"]) -> Float[Tensor, "frames 3 3"]:
+    """Return a link's orientations, Z up, from those of its canonical joint (xyzw), Y up."""
+    return rotations.to_matrix(
+        rotations.multiply(_TO_ROBOT.expand_as(quats), rotations.multiply(quats, tpose.expand_as(quats)))
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -346,7 +358,7 @@ class _System:
         for lag in range(4):  # of third differences
             row = np.zeros((frames, size))
             for later in range(lag, 4):
-                row[later : frames - 3 + later] += _THIRD[later - lag] * _THIRD[later] * self.jerk.numpy()
+                row[later : later + max(0, frames - 3)] += _THIRD[later - lag] * _THIRD[later] * self.jerk.numpy()
             if lag == 0:
                 row[1:, 6:] += self.coupling.numpy()
                 row[:-1, 6:] += self.coupling.numpy()

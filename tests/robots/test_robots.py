@@ -17,7 +17,7 @@ from mapctl.errors import FileFormatError, RequestError
 from mapctl.retarget.carry import retarget_motion
 from mapctl.robots import files, model, plausibility
 from mapctl.robots import retarget as solver
-from mapctl.robots.following import DELAY_FRAMES
+from mapctl.robots.following import DELAY_FRAMES, RobotFollower
 from mapctl.robots.retarget import RobotMotion, observe, retarget_to_robot
 from mapctl.streaming.sender import encode_frame
 
@@ -81,7 +81,7 @@ def test_links_are_where_mujoco_has_them(robot):
             np.testing.assert_allclose(world[frame, link] @ robot.zero[link], body.xmat.reshape(3, 3), atol=1e-9)
 
 
-def test_gradient_and_hessian_are_those_of_the_cost(robot):
+def test_gradient_is_that_of_the_cost(robot):
     """Against central differences of the cost, whose residuals are smooth there."""
     seen = observe(retarget_motion(walk(8), robot.character).motion, robot)
     pose = random_pose(robot, 8)
@@ -111,14 +111,13 @@ def test_gradient_and_hessian_are_those_of_the_cost(robot):
 def test_a_walk_stays_within_limits_with_feet_that_stand(robot, walked):
     assert bool(((walked.angles >= robot.low) & (walked.angles <= robot.high)).all())
     seen = observe(retarget_motion(walk(90), robot.character).motion, robot)
-    at, world = walked.chain_links()
-    points = at[:, seen.links] + (world[:, seen.links] @ seen.points[..., None])[..., 0]
+    points = walked.find_points(seen.links, seen.points)
     stays = walked.contacts[1:] & walked.contacts[:-1]
     assert float(stays.double().mean()) > 0.15
     slide = 30 * points[:, seen.tips].diff(dim=0).norm(dim=-1)[stays]
     assert float(slide.mean()) < 0.01
     assert float((points - seen.positions).norm(dim=-1)[:, seen.tips].mean()) < 0.02
-    soles = torch.cat(walked.find_soles(), dim=1)
+    soles = walked.find_points(robot.corner_links, torch.cat(robot.soles))
     assert float(soles[..., 2].min()) > -0.02
     assert float(walked.position[-1, 0] - walked.position[0, 0]) > 1.0  # X ahead
 
@@ -141,8 +140,14 @@ def test_speeds_of_joints_hold(folder):
     path = make_mjcf(folder / "slow.xml")
     path.with_suffix(".toml").write_text("speed = 2.5\n")
     slow = model.load(path)
-    found = retarget_to_robot(walk(60), slow)[0]
+    clip = walk(60)
+    found = retarget_to_robot(clip, slow)[0]
     assert float((30 * found.angles.diff(dim=0)).abs().max()) <= 2.5 + 1e-9
+    follower, parts = RobotFollower(slow, clip.skeleton), list[torch.Tensor]()
+    for first in range(0, 60, 3):
+        part = follower.push(clip.root_position[first : first + 3], clip.local_quat_xyzw[first : first + 3])
+        parts += [] if part is None else [part.angles]
+    assert float((30 * torch.cat(parts).diff(dim=0)).abs().max()) <= 2.5 + 1e-9
 
 
 def test_windows_join_without_a_seam(robot, monkeypatch):
@@ -189,6 +194,73 @@ def test_what_is_no_robot_is_refused_in_one_line(name, write, fault, tmp_path):
     with pytest.raises(FileFormatError, match=fault) as caught:
         model.load(tmp_path / name)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("quat", "back"),
+    [("1 0 0 1", "1 0 0 0"), ("1 1 0 0", "1 -1 0 0"), ("1 0 1 0", "1 0 -1 0"), ("1 1 1 1", "1 -1 0 0")],
+    ids=["heading", "rolled", "pitched", "rolled, heading"],
+)
+@pytest.mark.parametrize("base", ["<freejoint/>", ""])
+def test_the_base_may_have_any_frame_and_heading(quat, back, base, robot, tmp_path):
+    """Quaternions of the base, and of the links below it that leave but a heading."""
+    text = make_mjcf(tmp_path / "turned.xml").read_text().replace('pos="0 0 0.8"', f'pos="0 0 0.8" quat="{quat}"')
+    text = text.replace("<freejoint/>", f'{base}<frame quat="{back}">').replace(
+        "</body></world", "</frame></body></world"
+    )
+    (tmp_path / "turned.xml").write_text(text)
+    turned = model.load(tmp_path / "turned.xml")
+    torch.testing.assert_close(turned.axes, robot.axes, rtol=0, atol=1e-9)
+    torch.testing.assert_close(turned.skeleton.offsets, robot.skeleton.offsets, rtol=0, atol=1e-9)
+    torch.testing.assert_close(torch.cat(turned.soles).sum(0), torch.cat(robot.soles).sum(0), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3, 4])
+def test_the_shortest_motions_are_retargeted(frames, robot, walked, tmp_path):
+    found = retarget_to_robot(walk(90).slice(0, frames), robot)[0]
+    assert found.angles.shape == (frames, 21)
+    assert float((found.angles - walked.angles[:frames]).abs().max()) < 0.3
+    assert len(plausibility.assess(replace(found, fps=Fraction(1, 4)))) == frames
+    files.save(found, tmp_path / "short.npz")
+    with np.load(tmp_path / "short.npz") as arrays:
+        assert all(np.isfinite(arrays[name]).all() for name in ("joint_vel", "body_ang_vel_w"))
+
+
+def test_frames_may_come_many_at_once(robot):
+    clip, follower, counts = walk(90), RobotFollower(robot, walk(2).skeleton), list[int]()
+    for first, stop in ((0, 10), (10, 50), (50, 90)):
+        found = follower.push(clip.root_position[first:stop], clip.local_quat_xyzw[first:stop])
+        counts.append(0 if found is None else len(found.angles))
+    assert counts == [4, 40, 40]
+
+
+def test_a_trunk_of_one_joint_turns_as_the_chest(robot):
+    seen = observe(retarget_motion(walk(8), robot.character).motion, robot)
+    names = [robot.skeleton.names[link] for link in seen.links]
+    assert float(seen.orientation_weights[0, names.index("waist_yaw_link")]) > 0
+    assert "head" not in names  # is fixed to it
+
+
+def test_joints_need_no_names(robot, tmp_path):
+    text = make_mjcf(tmp_path / "bare.xml").read_text()
+    (tmp_path / "bare.xml").write_text(text.replace('<joint name="left_knee"', "<joint"))
+    bare = model.load(tmp_path / "bare.xml")
+    assert bare.joints[3] == "joint4"
+    fine, same = (plausibility.assess(random_pose(one)) for one in (robot, bare))
+    assert fine == same
+
+
+def test_speeds_that_are_no_numbers_are_refused(tmp_path):
+    with pytest.raises(FileFormatError, match="velocity of joints"):
+        model.load(make_urdf(tmp_path / "small.urdf", speed="fast"))
+
+
+@pytest.mark.parametrize("corners", ["[[0.1, 0]]", "[]"])
+def test_corners_of_a_sole_are_at_least_three_points(corners, folder):
+    path = make_mjcf(folder / "corners.xml")
+    path.with_suffix(".toml").write_text(f"[soles]\nleft_ankle_roll_link = {corners}\n")
+    with pytest.raises(FileFormatError, match="soles"):
+        model.load(path)
 
 
 @pytest.mark.parametrize("header", [True, False])
@@ -258,6 +330,26 @@ def test_the_command_writes_and_reads_a_robot(folder, robot, tmp_path, capsys):
     back = mapctl.load(tmp_path / "back.bvh")
     assert (back.num_frames, float(back.fps)) == (len(out.read_text().splitlines()) - 1, 50)
     assert 0.4 < float(back.root_position[:, 1].mean()) < 0.9  # Y up, on the robot's legs
+
+
+def test_a_robots_own_file_is_resampled_not_solved_again(folder, robot, walked, tmp_path):
+    files.save(walked, tmp_path / "walk.csv")
+    run("convert", tmp_path / "walk.csv", tmp_path / "walk.npz", "--robot", folder / "small.xml", "--fps", 60)
+    with np.load(tmp_path / "walk.npz") as arrays:
+        np.testing.assert_allclose(
+            arrays["joint_pos"][:-1:2], walked.angles[: len(arrays["joint_pos"]) // 2], atol=1e-5
+        )
+        np.testing.assert_allclose(arrays["body_pos_w"][0, 0], walked.position[0], atol=1e-5)
+
+
+def test_a_folder_becomes_a_robots_files(folder, tmp_path, capsys):
+    (tmp_path / "clips").mkdir()
+    formats.save(walk(20), tmp_path / "clips" / "walk.bvh")
+    words = ("convert", tmp_path / "clips", tmp_path / "out", "--robot", folder / "small.xml")
+    assert run(*words, "--to", ".csv") == 0
+    assert len((tmp_path / "out" / "walk.csv").read_text().splitlines()) == 20
+    assert run(*words) == 2
+    assert "--robot is for a robot's motion" in capsys.readouterr().err
 
 
 def test_a_header_is_for_robots_alone(tmp_path, capsys):

@@ -99,7 +99,8 @@ def _collect_jobs(source: Path, out: Path, ending: str | None) -> list[tuple[Pat
     for path in sources:
         own = path.suffix if path.suffix.lower() in formats.WRITERS and path.suffix.lower() != ".fbx" else ".bvh"
         result = out / path.relative_to(source).with_suffix(ending or own)
-        formats.check_ending(result)
+        if ending is None:
+            formats.check_ending(result)
         if (other := taken.setdefault(result, path)) != path:
             raise RequestError(f"{other} and {path} would both become {result}")
         if result.resolve() in given:
