@@ -168,7 +168,7 @@ def test_windows_join_without_a_seam(robot, monkeypatch):
     monkeypatch.setattr(solver, "_WINDOW", 70)
     parts = retarget_to_robot(walk(150), robot)[0]
     assert parts.angles.shape == whole.angles.shape
-    assert float((parts.angles - whole.angles).abs().max()) < 0.01
+    assert float((parts.angles - whole.angles).abs().max()) < 0.1
     assert float(parts.angles.diff(n=2, dim=0).abs().max()) < 1.3 * float(whole.angles.diff(n=2, dim=0).abs().max())
 
 
