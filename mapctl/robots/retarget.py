@@ -45,6 +45,7 @@ _HEEL_METRES = 0.015  # over its height on a flat foot, within which an ankle's 
 _ANGLE_ERROR = 1.0  # radians by which joints are away from zero, if nothing shows it
 _JERKS = (40.0, 1000.0, 2000.0)  # of the base's position, m/s^3, and orientation, and of joints, rad/s^3
 _SPEED_ERROR, _SPEED_SHARE = 1e-3, 0.98  # radians a frame beyond that share of a joint's largest speed
+_STIFF = 1e12  # weight that holds a joint at its limit
 _ITERATIONS, _LONGEST_STEP, _CONVERGED = 30, 0.5, 1e-4  # of the search; radians or metres; share of the cost
 _WINDOW, _OVERLAP, _HELD = 600, 30, 10  # frames that are solved at once; solved again; and of these the first, held
 
@@ -366,7 +367,18 @@ class _System:
                 row[1:, 6:] -= self.coupling.numpy()
             row[lag:] *= (free[lag:] & free[: frames - lag]).numpy()
             bands[-1 - lag * size] += row.ravel()
-        change = torch.from_numpy(solveh_banded(bands, (self.gradient * free).numpy().ravel()).reshape(frames, size))
+        right = (self.gradient * free).numpy().ravel()
+        change = torch.from_numpy(solveh_banded(bands, right).reshape(frames, size))
+        wanted = now.angles + change[:, 6:]
+        crossed = torch.zeros_like(free)
+        crossed[:, 6:] = (wanted < robot.low) | (wanted > robot.high)
+        if bool(crossed.any()):  # a joint that would cross its limit goes as far as that, and the others by that
+            stiff = _STIFF * crossed.double().numpy()
+            to_limit = torch.zeros_like(change)
+            to_limit[:, 6:] = wanted.clamp(robot.low, robot.high) - now.angles
+            bands[-1] += stiff.ravel()
+            right += (stiff * to_limit.numpy()).ravel()
+            change = torch.from_numpy(solveh_banded(bands, right).reshape(frames, size))
         change = change / (change.abs().amax(dim=1, keepdim=True) / _LONGEST_STEP).clamp_min(1.0)
         return replace(
             now,
