@@ -74,7 +74,7 @@ def make_mjcf(path, *, rename=lambda name: name, shapes=True, joint="hinge"):
     return path
 
 
-def make_urdf(path, speed=12.0):
+def make_urdf(path, speed: float | str = 12.0):
     """Write the humanoid as URDF, whose joints have a largest speed."""
     links, joints = ["pelvis"], []
 

@@ -60,15 +60,7 @@ _LARGE = 0.05  # metres of mean residual that are worth a warning
 _SHANK_RANGE = (0.12, 0.8)  # metres from knee to ankle of bodies in a unit that may be right
 
 
-def _find_joints_above() -> Bool[Tensor, "joints joints"]:
-    """Find which joints (columns) are above each joint, or it itself."""
-    table = torch.eye(len(_NAMES), dtype=torch.bool)
-    for joint, parent in enumerate(_PARENTS[1:], start=1):
-        table[joint] |= table[parent]
-    return table
-
-
-_ABOVE = _find_joints_above()
+_ABOVE = kinematics.find_joints_above(_PARENTS)
 _CROSS = torch.zeros(3, 3, 3, dtype=torch.float64)  # of a lever v the matrix M with M d = d x v
 for _a, _b, _c in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     _CROSS[_a, _b, _c], _CROSS[_a, _c, _b] = 1.0, -1.0

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import rotations
@@ -74,6 +74,15 @@ def positions_from_matrices(
 ) -> Float[Tensor, "*batch joints 3"]:
     """Return the joint positions (metres) relative to the root at the origin, from local rotation matrices."""
     return chain_matrices(skeleton.offsets.to(local_matrix), skeleton.parents, local_matrix)[0]
+
+
+def find_joints_above(parents: Sequence[int]) -> Bool[Tensor, "joints joints"]:
+    """Find which joints (columns) are above each joint, or it itself."""
+    table = torch.eye(len(parents), dtype=torch.bool)
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            table[joint] |= table[parent]
+    return table
 
 
 def chain_matrices(

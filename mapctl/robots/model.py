@@ -87,13 +87,7 @@ class Robot:
     @cached_property
     def above(self) -> Bool[Tensor, "links joints"]:
         """Whether each joint moves each link."""
-        found = torch.zeros(self.skeleton.num_joints, len(self.joints), dtype=torch.bool)
-        for link, parent in enumerate(self.skeleton.parents):
-            if parent >= 0:
-                found[link] = found[parent]
-            if link in self.hinges:
-                found[link, self.hinges.index(link)] = True
-        return found
+        return kinematics.find_joints_above(self.skeleton.parents)[:, list(self.hinges)]
 
     @property
     def feet(self) -> tuple[int, int]:

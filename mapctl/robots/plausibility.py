@@ -112,6 +112,10 @@ def _measure_balance(
     standing = motion.contacts.repeat_interleave(torch.tensor([left, right]), dim=1)
     for frame, stands in enumerate(standing):
         if stands.any():
-            hull = ConvexHull(corners[frame, stands, :2].numpy(), qhull_options="QJ").equations
-            found[frame] = max(0.0, float(np.max(hull[:, :2] @ centre[frame, :2].numpy() + hull[:, 2])))
+            points = corners[frame, stands, :2].numpy()
+            hull, at = ConvexHull(points, qhull_options="QJ"), centre[frame, :2].numpy()
+            if (hull.equations[:, :2] @ at + hull.equations[:, 2]).max() > 0:
+                start, along = points[hull.simplices[:, 0]], np.diff(points[hull.simplices], axis=1)[:, 0]
+                share = ((at - start) * along).sum(axis=1) / np.square(along).sum(axis=1)
+                found[frame] = np.linalg.norm(start + share.clip(0, 1)[:, None] * along - at, axis=1).min()
     return found

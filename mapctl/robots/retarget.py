@@ -251,7 +251,7 @@ class _Foot:
         return moved
 
 
-def start_search(robot: Robot, seen: Observations, fps: Fraction) -> "RobotMotion":
+def start_search(robot: Robot, seen: Observations, fps: Fraction) -> RobotMotion:
     """Return the start of a search: the base as observed, all joints at zero."""
     angles = torch.zeros(len(seen.positions), len(robot.joints), dtype=torch.float64).clamp(robot.low, robot.high)
     return RobotMotion(robot, fps, seen.positions[:, 0].clone(), seen.orientations[:, 0].clone(), angles, seen.standing)
@@ -343,7 +343,7 @@ class _System:
         gradient[:-1, 6:] += coupling * beyond
         return _System(float(cost), hessian, coupling.double(), gradient, jerk)
 
-    def step(self, now: RobotMotion, damping: float, held: int) -> "RobotMotion":
+    def step(self, now: RobotMotion, damping: float, held: int) -> RobotMotion:
         """Solve for the next motion."""
         robot, (frames, size) = now.robot, self.gradient.shape
         free = torch.ones(frames, size, dtype=torch.bool)
@@ -372,7 +372,7 @@ class _System:
         wanted = now.angles + change[:, 6:]
         crossed = torch.zeros_like(free)
         crossed[:, 6:] = (wanted < robot.low) | (wanted > robot.high)
-        if bool(crossed.any()):  # a joint that would cross its limit goes as far as that, and the others by that
+        if bool(crossed.any()):  # they end at their limits, and all others are solved for again
             stiff = _STIFF * crossed.double().numpy()
             to_limit = torch.zeros_like(change)
             to_limit[:, 6:] = wanted.clamp(robot.low, robot.high) - now.angles
@@ -407,7 +407,7 @@ def _differentiate(
     return by_position.mT, by_rotation.mT
 
 
-def _cut_speeds(found: RobotMotion) -> "RobotMotion":
+def _cut_speeds(found: RobotMotion) -> RobotMotion:
     """Cut what is left of speeds beyond the joints'."""
     most = found.robot.speed / float(found.fps)
     if not (found.angles.diff(dim=0).abs() > most).any():

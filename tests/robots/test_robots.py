@@ -397,3 +397,12 @@ def test_a_robot_follows_a_stream_as_it_would_the_whole(robot):
     assert float((numbers[30:, 1:4] - whole.position[30:84]).norm(dim=1).mean()) < 0.03
     assert float((angles - whole.angles[:84])[30:].abs().mean()) < 0.1
     assert float(angles.diff(n=3, dim=0).abs().mean()) < 2 * float(whole.angles.diff(n=3, dim=0).abs().mean())
+
+
+def test_balance_is_the_distance_from_the_sole_beyond_a_corner_too(robot, walked):
+    corners = torch.cat(robot.soles)[None]
+    stands = replace(walked.slice(0, 1), contacts=torch.tensor([[True, False]]))
+    farthest = robot.soles[0].amax(dim=0)
+    for away, expected in (((0.3, 0.4, 1.0), 0.5), ((0.2, -0.01, 1.0), 0.2), ((-0.01, -0.01, 1.0), 0.0)):
+        centre = (farthest + torch.tensor(away, dtype=torch.float64))[None]
+        assert float(plausibility._measure_balance(stands, corners, centre)[0]) == pytest.approx(expected, abs=1e-6)
