@@ -192,12 +192,13 @@ class Ground:
         assert self.image is not None
         try:
             with Image.open(self.image.file) as picture:
-                grey = np.asarray(picture if picture.mode.startswith("I") else picture.convert("L"), dtype=float)
+                deep = picture.mode.startswith("I")  # 16 bits
+                grey = np.asarray(picture if deep else picture.convert("L"), dtype=float)
         except (OSError, ValueError, Image.DecompressionBombError) as error:
             raise FileFormatError(self.image.file, "is not a picture that can be read") from error
         if min(grey.shape) < 2:
             raise FileFormatError(self.image.file, "a height field has 2 pixels a side at least")
-        return grey * (self.image.white / (65535.0 if grey.max() > 255 else 255.0))
+        return grey * (self.image.white / (65535.0 if deep else 255.0))
 
     def height(self, points: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
         """Return the heights at points of the floor (x, z), metres."""

@@ -1,9 +1,8 @@
 """`mapctl drive`: a robot does at once what a character does whose poses come over the VMC protocol."""
 
-import socket
 import time
 from collections import deque
-from contextlib import closing, suppress
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -19,7 +18,7 @@ from mapctl.robots import model
 from mapctl.robots.files import build_rows
 from mapctl.robots.following import DELAY_FRAMES, RobotFollower
 from mapctl.skeleton import CANONICAL
-from mapctl.streaming.messages import Endpoint, Message
+from mapctl.streaming.messages import Message
 
 if TYPE_CHECKING:
     from mapctl.streaming.receiver import OscReceiver
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
 ADDRESS = "/mapctl/robot"
 """Address of a frame: the stream's time, then the numbers of a row of a robot's .csv."""
 _FRAMES, _MOST_FRAMES = 3, 15  # that are solved at once, as steering computes them; where it is behind, all that came
-_PARSE_SECONDS = 0.05
 
 
 @dataclass(frozen=True)
@@ -48,20 +46,9 @@ class Drive(Command):
 
 def run(command: Drive) -> int:
     """Check, drive until Ctrl-C, and print what came and went."""
-    streaming.check_endpoints(command.stream, command.listen)
-    robot = model.load(command.robot)
-    from mapctl.streaming.receiver import OscReceiver
-
-    target = Endpoint.parse(command.stream, option="--stream")
-    family, address = target.resolve(option="--stream")
-    receiver = OscReceiver(Endpoint.parse(command.listen, option="--listen"), parse_seconds=_PARSE_SECONDS)
-    with closing(receiver), socket.socket(family, socket.SOCK_DGRAM) as out:
-        if not command.quiet:
-            print(f"poses of {receiver.endpoint} drive {command.robot.stem} at {target}; Ctrl-C ends", flush=True)
-        with suppress(KeyboardInterrupt):
-            _drive(Driver(robot), receiver, out, (address, target.port))
-    if not command.quiet:
-        print(f"\n{receiver.dropped} packets were not understood{receiver.fault and f' ({receiver.fault})'}")
+    driver, what = Driver(model.load(command.robot)), f"as those of {command.robot.stem}"
+    with streaming.open_relay(command.stream, command.listen, what=what, quiet=command.quiet) as (receiver, send):
+        _drive(driver, receiver, send)
     return 0
 
 
@@ -102,7 +89,7 @@ class Driver:
         return [Message(ADDRESS, (at, *row)) for at, row in zip(times, build_rows(found).tolist(), strict=True)]
 
 
-def _drive(driver: Driver, receiver: "OscReceiver", out: socket.socket, to: tuple[str, int]) -> None:
+def _drive(driver: Driver, receiver: "OscReceiver", send: Callable[[bytes], None]) -> None:
     from mapctl.streaming.sender import bundle, encode
 
     waiting, due = deque[Message](), time.perf_counter()
@@ -110,7 +97,6 @@ def _drive(driver: Driver, receiver: "OscReceiver", out: socket.socket, to: tupl
         waiting.extend(driver.take(receiver.poll()))
         now = time.perf_counter()
         while waiting and now >= due:  # in even steps: frames are solved several at once
-            with suppress(OSError):
-                out.sendto(bundle([encode(waiting.popleft())])[0], to)
+            send(bundle([encode(waiting.popleft())])[0])
             due = max(due + 1 / PRIOR_FPS, now + 0.5 / PRIOR_FPS)
         receiver.wait(max(0.0, due - now) if waiting else 1.0)

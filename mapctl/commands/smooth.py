@@ -1,8 +1,7 @@
 """`mapctl smooth`: poses of a tracker are smoothed on their way to a viewer, over the VMC protocol."""
 
-import socket
 import time
-from contextlib import closing, suppress
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,7 +10,6 @@ from tyro.conf import arg
 from mapctl.commands.shared import options, streaming
 from mapctl.commands.shared.command import Command
 from mapctl.errors import RequestError
-from mapctl.streaming.messages import Endpoint
 
 if TYPE_CHECKING:
     from mapctl.streaming.receiver import OscReceiver
@@ -20,7 +18,6 @@ if TYPE_CHECKING:
 _MAX_DELAY = 1.0  # seconds
 _MIN_DELAY = 0.05
 _FPS = 60
-_PARSE_SECONDS = 0.05  # no packet is left out because the machine is busy
 
 
 @dataclass(frozen=True)
@@ -41,26 +38,15 @@ def run(command: Smooth) -> int:
     """Check, relay until Ctrl-C, and print what came and went."""
     if not _MIN_DELAY <= command.delay <= _MAX_DELAY:
         raise RequestError(f"--delay must be {_MIN_DELAY:g} to {_MAX_DELAY:g} seconds, got {command.delay:g}")
-    streaming.check_endpoints(command.stream, command.listen)
-    from mapctl.streaming.receiver import OscReceiver
-    from mapctl.streaming.relay import PoseRelay
+    what = f"(VMC), {command.delay:g} s later"
+    with streaming.open_relay(command.stream, command.listen, what=what, quiet=command.quiet) as (receiver, send):
+        from mapctl.streaming.relay import PoseRelay
 
-    target = Endpoint.parse(command.stream, option="--stream")
-    family, address = target.resolve(option="--stream")
-    receiver = OscReceiver(Endpoint.parse(command.listen, option="--listen"), parse_seconds=_PARSE_SECONDS)
-    with closing(receiver), socket.socket(family, socket.SOCK_DGRAM) as out:
-        if not command.quiet:
-            print(
-                f"poses of {receiver.endpoint} go to {target} (VMC), {command.delay:g} s later; Ctrl-C ends", flush=True
-            )
-        with suppress(KeyboardInterrupt):
-            _relay(PoseRelay(command.delay), receiver, out, (address, target.port))
-    if not command.quiet:
-        print(f"\n{receiver.dropped} packets were not understood{receiver.fault and f' ({receiver.fault})'}")
+        _relay(PoseRelay(command.delay), receiver, send)
     return 0
 
 
-def _relay(relay: "PoseRelay", receiver: "OscReceiver", out: socket.socket, to: tuple[str, int]) -> None:
+def _relay(relay: "PoseRelay", receiver: "OscReceiver", send: Callable[[bytes], None]) -> None:
     began, frame, due = time.perf_counter(), 0, 0.0
     while True:
         now = time.perf_counter() - began
@@ -69,8 +55,7 @@ def _relay(relay: "PoseRelay", receiver: "OscReceiver", out: socket.socket, to: 
             packets += relay.frame(now)
             frame, due = frame + 1, max(due + 1 / _FPS, now)
         for packet in packets:
-            with suppress(OSError):  # nobody receives, or there is no room: the next frame comes anyway
-                out.sendto(packet, to)
+            send(packet)
         if is_due:
             relay.smoother.smooth()
         receiver.wait(max(0.0, due + began - time.perf_counter()))

@@ -1,6 +1,8 @@
 """Streams of poses and orders over OSC, for the commands that have them. The package python-osc is imported on use."""
 
-from collections.abc import Iterator, Sequence
+import socket
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
 
 _STREAM, _LISTEN = "--stream", "--listen"
 _MAX_DELAY = 5.0  # seconds
+_PARSE_SECONDS = 0.05  # in which a relay reads packets: none is left out because the machine is busy
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +76,31 @@ def open_receiver(text: str | None) -> "OscReceiver | None":
     from mapctl.streaming.receiver import OscReceiver
 
     return OscReceiver(Endpoint.parse(text, option=_LISTEN))
+
+
+@contextmanager
+def open_relay(
+    stream: str, listen: str, *, what: str, quiet: bool
+) -> Iterator[tuple["OscReceiver", Callable[[bytes], None]]]:
+    """Open a receiver, and what sends a packet on, until Ctrl-C; print `what` goes on, and what was not understood."""
+    check_endpoints(stream, listen)
+    from mapctl.streaming.receiver import OscReceiver
+
+    target = Endpoint.parse(stream, option=_STREAM)
+    family, address = target.resolve(option=_STREAM)
+    receiver = OscReceiver(Endpoint.parse(listen, option=_LISTEN), parse_seconds=_PARSE_SECONDS)
+    with closing(receiver), socket.socket(family, socket.SOCK_DGRAM) as out:
+
+        def send(packet: bytes) -> None:
+            with suppress(OSError):  # nobody receives, or there is no room: the next frame comes anyway
+                out.sendto(packet, (address, target.port))
+
+        if not quiet:
+            print(f"poses of {receiver.endpoint} go to {target} {what}; Ctrl-C ends", flush=True)
+        with suppress(KeyboardInterrupt):
+            yield receiver, send
+    if not quiet:
+        print(f"\n{receiver.dropped} packets were not understood{receiver.fault and f' ({receiver.fault})'}")
 
 
 def describe(stream: "PoseStream | None", receiver: "OscReceiver | None") -> Iterator[str]:
