@@ -29,6 +29,7 @@ from controllers.denoising.trajectory import correct_trajectory
 from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
+from mapctl.ground import Ground
 from mapctl.inbetweening import GapQuery
 from mapctl.metrics.faults import list_inspected_faults
 from mapctl.motion import Motion
@@ -81,6 +82,8 @@ class DenoiseSettings:
     capture: CaptureKind = "auto"
     """Whether the trajectory is as good as the pose (`studio`), or drifts and floats as in estimates from `video`: then
     standing toes correct it. `auto` decides by how fast those slide in the first segment; a causal run leaves it."""
+    ground: Ground | None = None
+    """What feet of a capture from video stand on, where it is not the floor at y = 0."""
     only_faults: bool = False
     """Whether all stays to the bit but the frames and joints of faults, and legs and hips by a foot at fault."""
     refinement: RefinementSettings = field(default_factory=RefinementSettings)
@@ -219,7 +222,7 @@ def _denoise_segment(
     observation = _Observation.of(inspection, settings, rig)
     proposal, contacts, spread = _propose(observation, denoiser)
     fused, share, error = _fuse(observation, proposal)
-    from_video = settings.capture == "video" or (settings.capture == "auto" and _drifts(fused, error))
+    from_video = settings.capture == "video" or (settings.capture == "auto" and _drifts(fused, error, settings.ground))
     if from_video:
         observation = observation.with_noise(settings, slow=True)
         fused, share, error = _fuse(observation.completed(proposal), None)
@@ -228,7 +231,7 @@ def _denoise_segment(
     fps, last = float(motion.fps), motion.num_frames - 1
     at = (torch.arange(shown.num_frames) * fps / PRIOR_FPS).round().long().clamp(max=last)
     contacts = contacts[at]
-    found = correct_trajectory(shown) if from_video else None
+    found = correct_trajectory(shown, ground=settings.ground) if from_video else None
     refined = refine(
         shown if found is None else found.motion,
         contacts,
@@ -244,7 +247,8 @@ def _denoise_segment(
     if found is not None and settings.capture == "auto":
         notes = (
             f"standing toes slide at {100 * found.drift:.0f} cm/s, as in estimates from video: hips are moved so that"
-            " they are still, on the floor at y = 0; --capture studio leaves them",
+            f" they are still, on the {'floor at y = 0' if settings.ground is None else 'ground'};"
+            " --capture studio leaves them",
         )
     whole = bool(inspection.known.all() and inspection.seen_root.all()) and not terms and found is None
     if whole and _measure_roughness(clean) > _measure_roughness(motion):
@@ -405,7 +409,7 @@ def _propose(
     return motion, follow(cleaned.contact_logits[0]), follow(cleaned.log_spread[0, :, 1:].double()).exp()
 
 
-def _drifts(motion: Motion, error: Float[Tensor, "frames joints"]) -> bool:
+def _drifts(motion: Motion, error: Float[Tensor, "frames joints"], ground: Ground | None) -> bool:
     """Return whether standing toes slide as in estimates from video, tremor aside, and faster than the errors of the
     angles, radians, explain: those are smooth over SMOOTH_FRAMES."""
     fps, weights = float(motion.fps), torch.ones(motion.num_frames, motion.num_joints, dtype=torch.float64)
@@ -414,7 +418,7 @@ def _drifts(motion: Motion, error: Float[Tensor, "frames joints"]) -> bool:
     smooth = replace(motion, root_position=root, local_quat_xyzw=torch.nn.functional.normalize(quats, dim=-1))
     away = float(error.square().mean().sqrt()) * leg_length(motion.skeleton)
     explained = away * PRIOR_FPS / (math.sqrt(2) * SMOOTH_FRAMES)  # as the derivative of errors so correlated
-    return correct_trajectory(smooth.resample(PRIOR_FPS), explained).from_video
+    return correct_trajectory(smooth.resample(PRIOR_FPS), explained, ground).from_video
 
 
 _DRIFT_HERTZ = 3.0  # half-power frequency of what is not tremor

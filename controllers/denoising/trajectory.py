@@ -15,6 +15,7 @@ from scipy import ndimage, sparse, special
 
 from mapctl import rotations
 from mapctl.contacts import REST_SPEED, TOE_LEVEL, compute_rest_log_probability
+from mapctl.ground import Ground
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, TOES, leg_length
 
@@ -44,21 +45,23 @@ class CorrectedTrajectory:
     in the body's own frame as under a walk in place, or where feet land and leave fast."""
 
 
-def correct_trajectory(motion: Motion, explained: float = 0.0) -> CorrectedTrajectory:
-    """Find the hips under which the standing toes of a canonical motion are still, on the floor at y = 0; `explained`
-    is the drift, m/s, that errors of its pose alone would show.
+def correct_trajectory(motion: Motion, explained: float = 0.0, ground: Ground | None = None) -> CorrectedTrajectory:
+    """Find the hips under which the standing toes of a canonical motion are still, on the floor at y = 0 or on the
+    `ground`; `explained` is the drift, m/s, that errors of its pose alone would show.
 
     Coordinates x of the hips minimise the sum over frames of w (dx + df)^2 / s_rest^2 + (dx - do)^2 / s^2 + (x - o)^2 /
     s_0^2, with captured hips o, toes f about the hips, and weights w, the probability that a toe stands: slow, below
     the hips and low. The drift s is estimated from the velocity of standing toes (empirical Bayes), so that hips over
     toes that are still stay; s_0 is s over its time of correlation, and the drift x - o has an acceleration in
-    proportion. Heights have w (x + f - r)^2 / s_level^2 in addition, r the height at which toes rest.
+    proportion. Heights have w (x + f - r)^2 / s_level^2 in addition, r the height at which toes rest,
+    over the ground that was under them in the solve before.
     """
     if motion.num_frames < 3:
         return CorrectedTrajectory(motion, 0.0, from_video=False)
     fps, hips = float(motion.fps), motion.root_position.numpy()
     toes = motion.joint_positions()[:, motion.skeleton.indices(TOES)].numpy()
-    about, lower = toes - hips[:, None], toes[..., 1].min(axis=1)
+    about = toes - hips[:, None]
+    lower = (toes[..., 1] - _find_levels(toes, ground)).min(axis=1)
     rest = TOE_REST_HEIGHT * leg_length(motion.skeleton) / leg_length(CANONICAL)
     window = 2 * round(_FLOOR_SECONDS * fps / 2) + 1
     floor = ndimage.percentile_filter(lower, _FLOOR_PERCENTILE, window, mode="nearest")
@@ -70,16 +73,17 @@ def correct_trajectory(motion: Motion, explained: float = 0.0) -> CorrectedTraje
     slide = rotations.rotate_ground(fps * torch.from_numpy(toes[..., [0, 2]]).diff(dim=0), -heading[:, None]).numpy()
     drift, stands = 0.0, np.zeros(slide.shape[:2])
     for error in _VELOCITY_ERRORS:
-        standing = _weigh_standing(about, found, rest, fps, error)
+        rests = rest + _find_levels(about + found[:, None], ground)
+        standing = _weigh_standing(about, found, rests, fps, error)
         stands = np.minimum(standing[1:], standing[:-1])
         # Of two normal coordinates the speed's median is sqrt(ln 4) of their standard deviation (Rayleigh).
         drift = _weighted_median(np.linalg.norm(slide, axis=-1), stands) / math.sqrt(math.log(4))
         drift = max(_LEAST_DRIFT, math.sqrt(max(0.0, drift**2 - REST_SPEED**2)))
         prior = (drift, _CORRELATION_SECONDS * drift)
-        ground = _solve(captured[:, [0, 2]], about[..., [0, 2]], stands, fps, prior)
-        levels = standing / TOE_LEVEL**2, rest - about[..., 1:2]
+        across = _solve(captured[:, [0, 2]], about[..., [0, 2]], stands, fps, prior)
+        levels = standing / TOE_LEVEL**2, rests[..., None] - about[..., 1:2]
         height = _solve(captured[:, 1:2], about[..., 1:2], stands, fps, (_SINK_SPEED, _SINK_HEIGHT), levels)
-        found = np.stack([ground[:, 0], height[:, 0], ground[:, 1]], axis=1)
+        found = np.stack([across[:, 0], height[:, 0], across[:, 1]], axis=1)
     steady = np.linalg.norm((stands[..., None] * slide).sum(axis=(0, 1))) / max(float(stands.sum()), 1e-9)
     shows = stands.max(axis=1).sum() > _STANCE_SECONDS * fps and np.ptp(floor) < _LEVEL_RANGE
     corrected = replace(motion, root_position=torch.from_numpy(found).to(motion.root_position))
@@ -88,14 +92,25 @@ def correct_trajectory(motion: Motion, explained: float = 0.0) -> CorrectedTraje
     )
 
 
+def _find_levels(toes: Float[ndarray, "frames 2 3"], ground: Ground | None) -> Float[ndarray, "frames 2"]:
+    """Find the heights of what is under toes, metres."""
+    if ground is None:
+        return np.zeros(toes.shape[:2])
+    return ground.height(torch.from_numpy(toes[..., [0, 2]])).numpy()
+
+
 def _weigh_standing(
-    about: Float[ndarray, "frames 2 3"], hips: Float[ndarray, "frames 3"], rest: float, fps: float, error: float
+    about: Float[ndarray, "frames 2 3"],
+    hips: Float[ndarray, "frames 3"],
+    rests: Float[ndarray, "frames 2"],
+    fps: float,
+    error: float,
 ) -> Float[ndarray, "frames 2"]:
-    """Weigh toes by the probability that they stand: at rest under the hips, and at the height of the floor."""
+    """Weigh toes by the probability that they stand: at rest under the hips, and at the heights at which they rest."""
     toes = torch.from_numpy(about + hips[:, None])
     speed_noise = torch.full((1, 1), error, dtype=toes.dtype)
     resting = compute_rest_log_probability(toes, torch.from_numpy(hips), fps, speed_noise).exp().numpy()
-    above = (toes[..., 1].numpy() - rest) / TOE_LEVEL
+    above = (toes[..., 1].numpy() - rests) / TOE_LEVEL
     return resting * special.expit(math.log(_SWING_HEIGHT / (TOE_LEVEL * math.sqrt(2 * math.pi))) - 0.5 * above**2)
 
 

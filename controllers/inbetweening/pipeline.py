@@ -16,6 +16,7 @@ from controllers.common.map_refinement import RefinementSettings, refine
 from controllers.inbetweening.keyframes import fit_drawings, measure_drawing_error
 from controllers.inbetweening.proposers import propose_through_keys
 from controllers.inbetweening.shrinkage import shrink
+from controllers.shots.uneven import Footing
 from mapctl import contacts, rotations
 from mapctl.curves.curve import Curve
 from mapctl.errors import RequestError
@@ -95,6 +96,8 @@ class InbetweenSolution(Solution):
     """The part of `seconds` spent on the in-betweener's proposal."""
     gap_notes: tuple[str, ...] = ()
     """A note on each of these gaps: proposer, error estimate, remarks."""
+    footing: Footing | None = None
+    """How feet stand and swing on a ground that is not flat."""
 
     @property
     def frame_ms(self) -> float:
@@ -130,6 +133,7 @@ class InbetweenSolution(Solution):
                 if source.reason
             ],
             **({"sides_apart_cm": max(apart)} if apart else {}),
+            **({} if self.footing is None else {"footing": self.footing.as_row()}),
             "timing": {
                 "draw_ms": 1000 * self.proposal_seconds,
                 "finish_ms": 1000 * (self.seconds - self.proposal_seconds),

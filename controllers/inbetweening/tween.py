@@ -16,8 +16,10 @@ from controllers.inbetweening.keyframes import (
     measure_drawing_error,
     missing_between_keys,
 )
+from controllers.inbetweening.on_ground import KeysOnGround
 from controllers.inbetweening.pipeline import FillOptions, InbetweenSolution, fill
 from mapctl import joint_ranges, rotations
+from mapctl.ground import Ground
 from mapctl.inbetweening.effector_targets import EffectorTargets, LooseKeys
 from mapctl.inbetweening.missing import interpolate_missing
 from mapctl.intent.keyframes import Key, Keys
@@ -113,14 +115,27 @@ def note_joint_ranges(canonical: Motion, missing: MissingMask, rigmap: RigMap) -
     return (*notes[:_MAX_NOTES], *more)
 
 
-def tween(motion: Motion, keys: Keys, inbetweener: Inbetweener, **options: Unpack[FillOptions]) -> InbetweenSolution:
+def tween(
+    motion: Motion,
+    keys: Keys,
+    inbetweener: Inbetweener,
+    *,
+    ground: Ground | None = None,
+    **options: Unpack[FillOptions],
+) -> InbetweenSolution:
     """Make a motion of the same length through the keys of a motion, of which all else is ignored.
 
-    RequestError for keys that do not fit the motion or its rig; keys that no body could meet in time are named in the
-    status, which is then infeasible.
+    RequestError for keys that do not fit the motion or its rig, and for keys on a `ground` that is not flat that are no
+    whole poses; keys that no body could meet in time are named in the status, which is then infeasible.
     """
     wanted = keys.checked(motion)
     canonical, rigmap, shown = keyframe_motion(wanted, motion, options.get("rig"))
+    if ground is not None:
+        standing, options["rig"] = KeysOnGround.of(motion, canonical, wanted, rigmap, ground), as_rig(rigmap)
+        done = tween(standing.on_floor(), keys, inbetweener, **options)
+        put, footing = standing.put_between(done.motion)
+        status = done.status.with_notes(footing.notes, infeasible=bool(footing.notes))
+        return replace(done, motion=put, footing=footing, status=status)
     missing, targets = missing_between_keys(wanted, motion, rigmap), collect_effector_targets(wanted, shown, rigmap)
     loose = collect_loose_keys(wanted, motion, rigmap)
     infeasible = check_keyframes(shown, canonical, rigmap, missing, targets, loose)

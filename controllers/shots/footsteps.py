@@ -367,7 +367,7 @@ def stand_on(motion: Motion, toes: Float[Tensor, "frames 2 3"], turns: Float[Ten
     lower = find_lowering(motion, ankles, keeps_ends=True)
     lower = torch.nn.functional.max_pool1d(lower[None], 9, 1, 4)[0]
     lower[[0, -1]] = 0.0
-    motion = bend_legs(lower_hips(motion, _smooth_between(lower)), ankles, turns)
+    motion = bend_legs(lower_by(motion, _smooth_between(lower)), ankles, turns)
     return replace(motion, local_quat_xyzw=rotations.make_sign_continuous(motion.local_quat_xyzw))
 
 
@@ -395,8 +395,8 @@ def find_lowering(
     return lower
 
 
-def lower_hips(motion: Motion, lower: Float[Tensor, " frames"]) -> Motion:
-    """Lower the hips by so many metres."""
+def lower_by(motion: Motion, lower: Float[Tensor, " frames"]) -> Motion:
+    """Lower a motion by so many metres."""
     return replace(motion, root_position=motion.root_position - torch.stack([0 * lower, lower, 0 * lower], dim=-1))
 
 

@@ -32,8 +32,9 @@ from controllers.shots.reaching import (
 )
 from controllers.shots.request import Reach, ShotRequest
 from controllers.shots.seams import OVERLAP, JoinedPieces, arrive, close_loop, fill_frames, go_on, join_pieces
+from controllers.shots.stairs import Stairs
 from controllers.shots.trajectory import Trajectory, plan_trajectory
-from controllers.shots.uneven import Footing, Stairs, step_onto_ground
+from controllers.shots.uneven import Footing, step_onto_ground
 from controllers.shots.walk import FollowSettings, check_path, check_tracking, slows_in_corners, walk_spans
 from mapctl.curves import Curve
 from mapctl.errors import RequestError
@@ -143,7 +144,8 @@ def solve_shot(
     notes += describe_conflicts(constraints, trajectory, motion)
     footing, footsteps = None, find_footsteps(motion)
     if request.ground is not None:
-        motion, footing, footsteps = step_onto_ground(motion, request.ground, character.toe_rest_height)
+        stepped = step_onto_ground(motion, request.ground, character.toe_rest_height)
+        motion, footing, footsteps = stepped.motion, stepped.measure_footing(), stepped.footsteps
         notes += footing.notes
     return ShotSolution(
         motion,

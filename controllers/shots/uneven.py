@@ -20,12 +20,9 @@ from numpy import ndarray
 from torch import Tensor
 
 from controllers.shots.footsteps import Footstep, bend_legs, find_ankles
-from controllers.shots.trajectory import Trajectory
 from mapctl import contacts, kinematics, rotations
-from mapctl.curves import Curve
 from mapctl.features import PRIOR_FPS
 from mapctl.ground import Ground
-from mapctl.intent.path import SpeedProfile, limit_speeds
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
 from mapctl.numerics.easing import smootherstep
@@ -34,7 +31,6 @@ from mapctl.numerics.smooth_offsets import smooth_between
 from mapctl.retarget.carry import lower_hips
 from mapctl.retarget.character import LEGS, limb_extension
 from mapctl.skeleton import CANONICAL, FEET, TOES, find_heels
-from mapctl.terms import RootVelocity, StepLength, Term
 
 STEEPEST = math.radians(15.0)
 """Slope up to which feet are put onto ground as on a flat floor, radians."""
@@ -44,11 +40,6 @@ CLEARANCE = 0.03
 """Metres that a swing foot keeps over edges."""
 EDGE = 0.03
 """Rise of the ground within 2 cm, metres, that is an edge."""
-_STEP_SECONDS = 0.5  # of a step of slow walks, whatever its length: `mapctl follow line:8 --speed 0.6` to 0.9
-_DEEPEST = 0.6  # metres of a tread that is taken in one step
-_BEFORE = 0.6  # metres before stairs, and after them, that are walked as slowly
-_EDGE_HEIGHT = 0.05  # metres of an edge of stairs
-_FACING, _STEP_SIGMA = 0.2, 0.03  # radians and metres by which hips and steps on stairs differ from path and treads
 _TOES_SHARE = 0.3  # of a foot from heel to ball, where a skeleton does not show how long its toes are
 _MARGIN, _HALF_WIDTH = 0.02, 0.04  # metres between a sole's ends and an edge, and of half a sole
 _LONGER = 0.4  # times that it counts if the ground is uneven under a longer sole than the shortest
@@ -118,9 +109,7 @@ class Foothold:
     @property
     def up(self) -> Float[Tensor, "4"]:
         """Rotation from the floor to the plane."""
-        x, z = self.gradient
-        upright = self.gradient.new_tensor([0.0, 1.0, 0.0])
-        return rotations.between_vectors(upright, torch.stack([-x, torch.ones_like(x), -z]))
+        return find_slope(self.gradient)
 
 
 @dataclass(frozen=True)
@@ -177,59 +166,99 @@ class Footing:
         return tuple(found)
 
 
-@dataclass(frozen=True)
-class Stairs:
-    """Treads of a path that are shorter than a step, and how they are walked: slowly, a step a tread."""
+def find_feet(motion: Motion) -> tuple[Float[Tensor, "frames 2 3"], Float[Tensor, "frames 2 4"]]:
+    """Return the toe joints of a canonical motion, world, metres, and the rotations of its feet."""
+    toes, feet = (list(CANONICAL.indices(names)) for names in (TOES, FEET))
+    return motion.joint_positions()[:, toes].double(), motion.joint_rotations()[:, feet].double()
 
-    treads: tuple[tuple[float, float], ...] = ()
-    """Arcs of the edges before each and after it, metres."""
 
-    @staticmethod
-    def find(curve: Curve, ground: Ground | None) -> "Stairs":
-        """Find the treads along a path over a ground; none without one."""
-        if ground is None:
-            return Stairs()
-        arcs = torch.linspace(0, curve.length, max(2, round(curve.length / _GRID) + 1), dtype=torch.float64)
-        rises = ground.height(curve.ground_point(arcs)).diff().abs() > _EDGE_HEIGHT
-        edges = [float(arcs[start]) for _, start, _ in true_intervals(rises[:, None])]
-        return Stairs(tuple((one, other) for one, other in pairwise(edges) if other - one < _DEEPEST))
+def find_slope(gradient: Float[Tensor, "2"]) -> Float[Tensor, "4"]:
+    """Return the rotation from the floor to a plane that rises so along x and along z."""
+    x, z = gradient
+    upright = gradient.new_tensor([0.0, 1.0, 0.0])
+    return rotations.between_vectors(upright, torch.stack([-x, torch.ones_like(x), -z]))
 
-    def slow(self, profile: SpeedProfile, curve: Curve, slowest: float) -> SpeedProfile:
-        """Lower speeds, m/s, so that a step is one tread long; to `slowest` at most, m/s."""
-        limits = [
-            (one - _BEFORE, other + _BEFORE, max(slowest, (other - one) / _STEP_SECONDS)) for one, other in self.treads
+
+@dataclass(frozen=True, eq=False)
+class SteppedMotion:
+    """A motion that was put onto ground."""
+
+    motion: Motion
+    """Canonical joints at PRIOR_FPS."""
+    flat: Motion
+    """The motion over the flat floor."""
+    ground: Ground
+    soles: Sequence[Sole]
+    """Left and right."""
+    holds: Sequence[Foothold]
+    """Footholds of both feet in the order of their beginnings."""
+    tracks: "Sequence[_FootTrack]"
+    """Left and right."""
+
+    @property
+    def footsteps(self) -> list[Footstep]:
+        """Steps from foothold to foothold."""
+        steps = [
+            Footstep(one.foot, one.stop - 1, other.start, toe=tuple((other.toe + other.moved).tolist()))
+            for foot in range(2)
+            for one, other in pairwise([hold for hold in self.holds if hold.foot == foot])
         ]
-        return limit_speeds(profile, curve, limits)
+        return sorted(steps, key=lambda step: step.land)
 
-    def terms(self, trajectory: Trajectory, first: int, frames: int) -> tuple[Term, ...]:
-        """Return the terms of a window from frame `first` on: on treads steps are as long as these, and hips face along
-        the path, from which slow walks turn them."""
-        if not self.treads:
-            return ()
-        arcs = trajectory.arcs[torch.arange(first, first + frames).clamp(max=len(trajectory.arcs) - 1)]
-        found = torch.tensor([(one, other) for one, other in self.treads], dtype=torch.float64).reshape(-1, 1, 2)
-        on = ((arcs > found[..., 0] - _BEFORE) & (arcs < found[..., 1] + _BEFORE)).any(dim=0)
-        if not bool(on.any()):
-            return ()
-        still, facing = torch.zeros(len(arcs), 2), rotations.unwrap_angle(trajectory.curve.heading(arcs))
-        face = RootVelocity(still, still[:0], facing, sigma_speed=math.inf, sigma_facing=_FACING, name="facing")
-        if float(on.double().mean()) < 0.5:
-            return (face,)
-        return face, StepLength(sum(other - one for one, other in self.treads) / len(self.treads), sigma=_STEP_SIGMA)
+    def lift_swings(self, keys: Sequence[int]) -> "SteppedMotion":
+        """Lift swing feet again where they come too near to the ground, but in the frames of `keys`."""
+        (toes, feet), (_, flat_feet) = find_feet(self.motion), find_feet(self.flat)
+        for foot, (track, sole) in enumerate(zip(self.tracks, self.soles, strict=True)):
+            own, flat = feet[:, foot], flat_feet[:, foot]
+            toes[:, foot] = track.lift(toes[:, foot], own, flat, self.ground, sole, keys)
+        ankles = find_ankles(self.motion.skeleton, toes, feet)
+        return replace(self, motion=bend_legs(self.motion, ankles, feet))
+
+    def measure_footing(self) -> Footing:
+        """Measure how feet stand and swing."""
+        (toes, turns), (flat, flat_turns) = find_feet(self.motion), find_feet(self.flat)
+        clearance, depth, level = math.inf, 0.0, torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+        speeds = list[Tensor]()
+        for foot, (sole, track) in enumerate(zip(self.soles, self.tracks, strict=True)):
+            points = sole.points(toes[:, foot], turns[:, foot], track.up)
+            before = sole.points(flat[:, foot], flat_turns[:, foot], level.expand(len(flat), 4))[..., 1]
+            over = points[..., 1] - self.ground.height(points[..., ::2])
+            depth = max(depth, float((before.clamp(max=0) - over).max()))
+            stays = track.standing[1:] & track.standing[:-1]
+            speeds.append(points[:, 2].diff(dim=0).norm(dim=-1)[stays] * PRIOR_FPS)
+            swing = _sample_between(points)[~stays]
+            edge, highest = _is_near_edge(swing, self.ground)
+            passing = edge & (self.ground.height(swing[..., ::2]) > highest - EDGE / 2)
+            if bool(passing.any()):
+                clearance = min(clearance, float((swing[..., 1] - highest)[passing].min()))
+        rises = [
+            abs(one.height - other.height)
+            - float(max(one.gradient.norm(), other.gradient.norm()) * (one.toe - other.toe).norm())
+            for one, other in pairwise(self.holds)
+        ]
+        return Footing(
+            clearance,
+            depth,
+            sum(hold.over_edge for hold in self.holds),
+            math.atan(max(float(hold.gradient.norm()) for hold in self.holds)),
+            max(0.0, *rises),
+            float(torch.stack([track.standing for track in self.tracks]).double().mean()),
+            float(torch.cat(speeds).mean()),
+        )
 
 
-def step_onto_ground(motion: Motion, ground: Ground, rest_height: float) -> tuple[Motion, Footing, list[Footstep]]:
+def step_onto_ground(motion: Motion, ground: Ground, rest_height: float, *, keys: Sequence[int] = ()) -> SteppedMotion:
     """Put a motion on the flat floor, canonical joints at PRIOR_FPS with toe joints resting at a height (metres), onto
-    the ground; also return how its feet stand there, and its footsteps."""
+    the ground. Footholds in the frames of `keys` stay."""
     soles = [Sole.of(motion, rest_height, foot) for foot in range(2)]
-    holds = _choose_footholds(_find_footholds(motion), motion, ground, soles)
-    flat, turned = motion.joint_positions().double(), motion.joint_rotations().double()
+    holds = _choose_footholds(_find_footholds(motion), motion, ground, soles, keys)
+    flat, flat_turns = find_feet(motion)
     toes, turns, tracks = [], [], list[_FootTrack]()
     for foot, sole in enumerate(soles):
-        own, turn = [hold for hold in holds if hold.foot == foot], turned[:, CANONICAL.index(FEET[foot])]
-        tracks.append(_FootTrack.of(own, flat[:, CANONICAL.index(TOES[foot])], ground, sole))
+        own, turn = [hold for hold in holds if hold.foot == foot], flat_turns[:, foot]
+        tracks.append(_FootTrack.of(own, flat[:, foot], ground, sole))
         turns.append(rotations.multiply(tracks[-1].up, turn))
-        toes.append(tracks[-1].lift(turns[-1], turn, ground, sole))
+        toes.append(tracks[-1].lift(tracks[-1].toe, turns[-1], turn, ground, sole))
     sigma, root, turns = _HIPS_SECONDS * PRIOR_FPS, motion.root_position.double().clone(), torch.stack(turns, dim=1)
     root[:, ::2] += gaussian.smooth(torch.stack([track.moved for track in tracks]).mean(dim=0), sigma)
     root[:, 1] += gaussian.smooth(torch.stack([track.height for track in tracks]).mean(dim=0), sigma)
@@ -237,13 +266,7 @@ def step_onto_ground(motion: Motion, ground: Ground, rest_height: float) -> tupl
     lowered = lower_hips(replace(motion, root_position=root), ankles, limb_extension(motion, LEGS))
     done = bend_legs(lowered, ankles, turns)
     done = replace(done, local_quat_xyzw=rotations.make_sign_continuous(done.local_quat_xyzw))
-    steps = [
-        Footstep(one.foot, one.stop - 1, other.start, toe=tuple((other.toe + other.moved).tolist()))
-        for foot in range(2)
-        for one, other in pairwise([hold for hold in holds if hold.foot == foot])
-    ]
-    footing = _measure(done, motion, holds, ground, soles, tracks)
-    return done, footing, sorted(steps, key=lambda step: step.land)
+    return SteppedMotion(done, motion, ground, soles, holds, tracks)
 
 
 def _find_footholds(motion: Motion) -> list[Foothold]:
@@ -260,7 +283,7 @@ def _find_footholds(motion: Motion) -> list[Foothold]:
 
 
 def _choose_footholds(
-    holds: Sequence[Foothold], motion: Motion, ground: Ground, soles: Sequence[Sole]
+    holds: Sequence[Foothold], motion: Motion, ground: Ground, soles: Sequence[Sole], keys: Sequence[int]
 ) -> list[Foothold]:
     """Move footholds along the direction of travel: the least sum of squares of how far each is moved, how much farther
     than the one before, how uneven the ground under its sole is, and how much too high it is (Viterbi 1967)."""
@@ -273,7 +296,7 @@ def _choose_footholds(
         middle = (hold.start + hold.stop) // 2
         yaw = rotations.split_heading(feet[middle, CANONICAL.index(FEET[hold.foot])])[0]
         moved = offsets[:, None] * ahead[middle]
-        found.append((moved, *_fit_planes(hold.toe + moved, yaw, ground, soles[hold.foot])))
+        found.append((moved, *fit_planes(hold.toe + moved, yaw, ground, soles[hold.foot])))
     cost, came = torch.zeros_like(offsets), []
     between = ((offsets[:, None] - offsets) / _MOVED).square()
     for number, (_, heights, gradients, uneven, _) in enumerate(found):
@@ -284,7 +307,9 @@ def _choose_footholds(
             high = ((rise - HIGHEST).clamp_min(0) / _TOO_HIGH).square()
             cost, back = (cost[:, None] + between + high).min(dim=0)
             came.append(back)
-        cost = cost + (offsets / _MOVED).square() + (uneven / _UNEVEN).square()
+        is_key = any(holds[number].start <= key < holds[number].stop for key in keys)
+        moving = torch.where(offsets.abs() < _GRID / 2, 0.0, math.inf) if is_key else offsets / _MOVED
+        cost = cost + moving.square() + (uneven / _UNEVEN).square()
     at, chosen = int(cost.argmin()), []
     for number in range(len(holds) - 1, -1, -1):
         moved, heights, gradients, _, over = (values[at] for values in found[number])
@@ -294,7 +319,7 @@ def _choose_footholds(
     return chosen[::-1]
 
 
-def _fit_planes(
+def fit_planes(
     toes: Float[Tensor, "n 2"], yaw: Tensor, ground: Ground, sole: Sole
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 2"], Float[Tensor, " n"], Bool[Tensor, " n"]]:
     """Fit planes to the ground under soles with toe joints at points (x, z): heights below these, gradients along x and
@@ -367,19 +392,33 @@ class _FootTrack:
         base[:, 1] += height[:, 0]
         return _FootTrack(base, up, moved, height[:, 0], toe[:, 1], swings, standing)
 
+    @property
+    def toe(self) -> Float[Tensor, "frames 3"]:
+        """Toe joint, before it is lifted."""
+        upright = torch.zeros_like(self.base)
+        upright[:, 1] = self.rest
+        return self.base + rotations.rotate(self.up, upright)
+
     def lift(
-        self, turns: Float[Tensor, "frames 4"], flat_turns: Float[Tensor, "frames 4"], ground: Ground, sole: Sole
+        self,
+        toe: Float[Tensor, "frames 3"],
+        turns: Float[Tensor, "frames 4"],
+        flat_turns: Float[Tensor, "frames 4"],
+        ground: Ground,
+        sole: Sole,
+        keys: Sequence[int] = (),
     ) -> Float[Tensor, "frames 3"]:
-        """Return the toe joint, lifted in its swings where the sole would come too near to the ground."""
-        level, upright = torch.zeros_like(self.up), torch.zeros_like(self.base)
+        """Return a toe joint, lifted in its swings where the sole would come too near to the ground, but in the frames
+        of `keys`."""
+        level, upright, lifted = torch.zeros_like(self.up), torch.zeros_like(self.base), toe.clone()
         level[:, 3], upright[:, 1] = 1.0, self.rest
-        toe = self.base + rotations.rotate(self.up, upright)
         flat, points = sole.points(upright, flat_turns, level), sole.points(toe, turns, self.up)
         need = _find_need(_sample_between(points), _sample_between(flat)[..., 1], ground)
         need = torch.nn.functional.pad(need, (1, 1), value=-torch.inf).unfold(0, 2, 1).amax(dim=-1)
         for start, stop in self.swings:
-            toe[start:stop, 1] += _lift_smoothly(need[start:stop])
-        return toe
+            for before, after in pairwise([start - 1, *(key for key in sorted(keys) if start <= key < stop), stop]):
+                lifted[before + 1 : after, 1] += _lift_smoothly(need[before + 1 : after])
+        return lifted
 
 
 def _stretch_over(
@@ -465,45 +504,3 @@ def _lift_smoothly(need: Float[Tensor, " frames"]) -> Float[Tensor, " frames"]:
     bends = np.diff(np.eye(frames + 4), 2, axis=0)[:, 2:-2]
     found = scipy.optimize.lsq_linear(bends, np.zeros(len(bends)), bounds=(lowest, np.inf))
     return need.new_tensor(found.x)
-
-
-def _measure(
-    done: Motion,
-    motion: Motion,
-    holds: Sequence[Foothold],
-    ground: Ground,
-    soles: Sequence[Sole],
-    tracks: Sequence[_FootTrack],
-) -> Footing:
-    """Measure how feet stand and swing."""
-    toes, turns = (values.double() for values in (done.joint_positions(), done.joint_rotations()))
-    flat, flat_turns = (values.double() for values in (motion.joint_positions(), motion.joint_rotations()))
-    clearance, depth, level = math.inf, 0.0, torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
-    speeds = list[Tensor]()
-    for foot, (sole, track) in enumerate(zip(soles, tracks, strict=True)):
-        toe, ankle = CANONICAL.index(TOES[foot]), CANONICAL.index(FEET[foot])
-        points = sole.points(toes[:, toe], turns[:, ankle], track.up)
-        before = sole.points(flat[:, toe], flat_turns[:, ankle], level.expand(len(flat), 4))[..., 1]
-        over = points[..., 1] - ground.height(points[..., ::2])
-        depth = max(depth, float((before.clamp(max=0) - over).max()))
-        stays = track.standing[1:] & track.standing[:-1]
-        speeds.append(points[:, 2].diff(dim=0).norm(dim=-1)[stays] * PRIOR_FPS)
-        swing = _sample_between(points)[~stays]
-        edge, highest = _is_near_edge(swing, ground)
-        passing = edge & (ground.height(swing[..., ::2]) > highest - EDGE / 2)
-        if bool(passing.any()):
-            clearance = min(clearance, float((swing[..., 1] - highest)[passing].min()))
-    rises = [
-        abs(one.height - other.height)
-        - float(max(one.gradient.norm(), other.gradient.norm()) * (one.toe - other.toe).norm())
-        for one, other in pairwise(holds)
-    ]
-    return Footing(
-        clearance,
-        depth,
-        sum(hold.over_edge for hold in holds),
-        math.atan(max(float(hold.gradient.norm()) for hold in holds)),
-        max(0.0, *rises),
-        float(torch.stack([track.standing for track in tracks]).double().mean()),
-        float(torch.cat(speeds).mean()),
-    )

@@ -17,6 +17,7 @@ from mapctl import formats, report
 from mapctl.commands.shared import folders, inputs, options, outputs, results
 from mapctl.commands.shared.command import ModelCommand, conclude
 from mapctl.errors import RequestError
+from mapctl.ground import Ground
 from mapctl.motion import join_licences
 from mapctl.protocols import Denoiser, Inbetweener
 from mapctl.recording.masks import load_masks, masks_from_missing
@@ -41,6 +42,9 @@ class Denoise(ModelCommand, options.RigOptions):
     """`video`: move the hips so that standing toes neither slide nor leave the floor at y = 0, for estimates from
     video, whose body drifts and floats. `studio`: the trajectory is as good as the pose. `auto`: as video where
     standing toes slide faster than captured ones do, but not under a walk in place. --causal keeps the trajectory."""
+    ground: options.MaybeFile = None
+    """TOML file of the ground under a capture from video, where it is not the floor at y = 0: ramps and stairs (see
+    `mapctl follow --help`)."""
     only_faults: bool = False
     """Repair only the faults that `mapctl measure` lists, but for noise and smoothing: all other frames and joints stay
     to the bit. A foot at fault changes legs and hips from 0.3 s before it to 0.3 s after."""
@@ -73,7 +77,8 @@ class Denoise(ModelCommand, options.RigOptions):
 
     @property
     def settings(self) -> DenoiseSettings:
-        return DenoiseSettings(capture=self.capture, only_faults=self.only_faults)
+        ground = None if self.ground is None else Ground.read(self.ground)
+        return DenoiseSettings(capture=self.capture, ground=ground, only_faults=self.only_faults)
 
 
 _MAX_NAMED = 6
@@ -87,6 +92,8 @@ def run(command: Denoise) -> int:
         raise RequestError("--causal has no time for a density; leave --prior out")
     if command.causal and command.capture == "video":
         raise RequestError("--capture video finds the floor from the whole capture; leave it or --causal out")
+    if command.ground is not None and (command.causal or command.only_faults or command.capture == "studio"):
+        raise RequestError("--ground is for the hips of captures from video; leave it out")
     if command.causal and command.only_faults:
         raise RequestError("--only-faults finds faults in the whole capture; leave it or --causal out")
     _ = command.settings  # refuses before models are loaded

@@ -22,6 +22,7 @@ from controllers.inbetweening.variations import Source, Tweening, sample_variati
 from mapctl.commands.shared import inputs, options, outputs, results
 from mapctl.commands.shared.command import NOT_SATISFIED, ModelCommand, conclude
 from mapctl.errors import FileFormatError, RequestError
+from mapctl.ground import Ground
 from mapctl.intent.keyframes import KeyRequest, Keys, read_keys
 from mapctl.protocols import Inbetweener
 from mapctl.report import write_report
@@ -51,6 +52,9 @@ class Tween(ModelCommand, options.RigOptions, options.ProposalOptions):
     own."""
     root_only: bool = False
     """Keys between the first and the last give only the position and the facing of the hips."""
+    ground: options.MaybeFile = None
+    """TOML file of the ground that the keys, whole poses, stand on, where it is not flat (see `mapctl follow --help`).
+    """
     suggest_timing: bool = False
     """Print how many frames mocap takes from each whole pose to the next, beside what is given; the motion keeps the
     given timing."""
@@ -90,11 +94,11 @@ def _run_request(command: Tween, request: KeyRequest | None) -> int:
     clip, dna = _read_keyframe_clip(command, request), results.read_dna(command)
     models = results.load_models(command, prior=command.prior, dna=dna)
     refinement, densities = None if command.no_refine else INFILL_REFINEMENT, priors.load_choice(command.prior)
+    ground = None if command.ground is None else Ground.read(command.ground)
 
     def make(by: Inbetweener, generator: torch.Generator) -> InbetweenSolution:
-        return tween(
-            clip.motion, clip.keys, by, refinement=refinement, densities=densities, rig=clip.rig, generator=generator
-        )
+        options = {"refinement": refinement, "densities": densities, "rig": clip.rig, "generator": generator}
+        return tween(clip.motion, clip.keys, by, ground=ground, **options)
 
     if command.variations > 1:
         ok = _run_variations(command, clip, make, models, dna)
@@ -112,7 +116,8 @@ def _run_request(command: Tween, request: KeyRequest | None) -> int:
     if not command.quiet:
         ms, count = 1000 * done.seconds / done.motion.num_frames, len(clip.keys.frames)
         print(f"{command.out}: {done.motion.num_frames} frames through {count} keys; {ms:.1f} ms a frame")
-        print("".join(f"{note}\n" for note in (*done.notes, *done.gap_notes)), end="")
+        footing = () if done.footing is None else (f"ground: {done.footing.text}",)
+        print("".join(f"{note}\n" for note in (*footing, *done.notes, *done.gap_notes)), end="")
         if intervals:
             rows = [(i.start, i.stop, i.given, i.suggested, i.reason) for i in intervals]
             outputs.print_table(("key", "next", "given", "suggested", "why"), rows, title="frames between keys")
@@ -142,6 +147,8 @@ def _check(command: Tween, request: KeyRequest | None) -> None:
             raise RequestError("--seed is of what is drawn, and nothing is; ask for --variations or --method rollouts")
         results.check_destinations(command.out, command.video, command.report, given=given)
         return
+    if command.ground is not None:
+        raise RequestError("--ground is for one answer; leave --variations out")
     if command.method == "slerp":
         raise RequestError("--method slerp has one answer only; leave --variations out")
     if command.suggest_timing:
