@@ -73,10 +73,26 @@ class Constraint:
         return {"constraint": self.name, **{name: getattr(self, name) for name in names}}
 
 
-def check_constraints(
-    request: ShotRequest, trajectory: Trajectory, motion: Motion, met: Sequence[MetPose] = ()
-) -> tuple[Constraint, ...]:
-    """Measure every constraint of a request on its motion, at PRIOR_FPS; poses as they were met."""
+def check_keys(request: ShotRequest, motion: Motion, met: Sequence[MetPose] = ()) -> tuple[Constraint, ...]:
+    """Measure what is reached for and looked at on a motion at PRIOR_FPS; poses as they were met."""
+    found, positions = list[Constraint](), motion.joint_positions()
+    for reach in request.reaches:
+        targets = ReachTargets.of((reach,), motion.num_frames).targets
+        miss = 100 * float(compute_target_errors(positions, targets).max())
+        name = f"{', '.join(reach.positions)} at {round(reach.seconds, 2):g} s"
+        limit = max(_REACH_CM, 100 * max(map(reach.tolerance_of, reach.positions)))
+        remedy = _find_remedy(reach, motion) if miss > limit else ""
+        found.append(Constraint(name, _held(reach), miss, limit, "cm", remedy=remedy, seconds=_span(reach)))
+    found += [_check_pose(one, motion) for one in met]
+    for look in request.looks:
+        worst = float(measure_look_errors(motion, look).max())
+        name = f"look at {round(look.seconds, 2):g} s"
+        found.append(Constraint(name, "straight", worst, _LOOK_DEG, "degrees", seconds=_span(look)))
+    return tuple(found)
+
+
+def check_walk(request: ShotRequest, trajectory: Trajectory, motion: Motion) -> tuple[Constraint, ...]:
+    """Measure the other constraints of a request on a motion at PRIOR_FPS over a flat floor."""
     positions = motion.joint_positions()
     hips = positions[:, 0, ::2]
     away = _find_frames_away(request, trajectory)
@@ -90,18 +106,6 @@ def check_constraints(
         steps = torch.diff(torch.cat([positions, positions[:1]]), dim=0).norm(dim=-1).amax(dim=1) * PRIOR_FPS
         most = _SEAM_RATIO * float(steps[:-1].max())
         found.append(Constraint("loop", "last frame leads into the first", float(steps[-1]), most, "m/s"))
-    for reach in request.reaches:
-        targets = ReachTargets.of((reach,), motion.num_frames).targets
-        miss = 100 * float(compute_target_errors(positions, targets).max())
-        name = f"{', '.join(reach.positions)} at {round(reach.seconds, 2):g} s"
-        limit = max(_REACH_CM, 100 * max(map(reach.tolerance_of, reach.positions)))
-        remedy = _find_remedy(reach, motion) if miss > limit else ""
-        found.append(Constraint(name, _held(reach), miss, limit, "cm", remedy=remedy, seconds=_span(reach)))
-    found += [_check_pose(one, motion) for one in met]
-    for look in request.looks:
-        worst = float(measure_look_errors(motion, look).max())
-        name = f"look at {round(look.seconds, 2):g} s"
-        found.append(Constraint(name, "straight", worst, _LOOK_DEG, "degrees", seconds=_span(look)))
     for step in (step for step in request.footsteps if step.land < motion.num_frames):
         toe, side, at = CANONICAL.index(TOES[step.foot]), SIDES[step.foot], step.land / PRIOR_FPS
         miss = 100 * float((positions[step.land, toe, ::2] - positions.new_tensor(step.toe)).norm())

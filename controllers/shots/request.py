@@ -325,9 +325,10 @@ class ShotRequest:
             "a loop needs a closed curve, and this one is open": self.loop and not self.curve.closed,
             "a loop is walked once around, in its stride: without start, end, seconds, speeds by time": self.loop
             and (ends or self.seconds is not None or timed),
-            "on a ground a shot has a curve of x,z, standing ends and obstacles: no keys, clips, footsteps or loop": (
+            "on a ground a shot has a curve of x,z, standing ends, obstacles, reaches and looks: no poses, clips,"
+            " footsteps or loop": (
                 self.ground is not None
-                and bool(self.reaches or self.looks or self.poses or self.footsteps or self.loop)
+                and bool(self.poses or self.footsteps or self.loop)
                 | (self.lead is not None or self.arrival is not None or self.curve.dims == 3)
             ),
         }
@@ -358,6 +359,20 @@ class ShotRequest:
             if _are_together(one, other):
                 raise RequestError(f"two poses are within two frames, at {one.seconds:g} s and at {other.seconds:g} s")
         self._check_obstacles()
+
+    def lower_targets(self, rise: Float[Tensor, " frames"]) -> "ShotRequest":
+        """Return the request with what is reached for and looked at lower by the ground's rise at that time, metres."""
+
+        def lower(position: WorldPosition, seconds: float) -> WorldPosition:
+            x, y, z = position
+            return x, y - float(rise[min(round(seconds * PRIOR_FPS), len(rise) - 1)]), z
+
+        reaches = tuple(
+            replace(key, positions={name: lower(position, key.seconds) for name, position in key.positions.items()})
+            for key in self.reaches
+        )
+        looks = tuple(replace(key, position=lower(key.position, key.seconds)) for key in self.looks)
+        return replace(self, reaches=reaches, looks=looks)
 
     def _check_obstacles(self) -> None:
         """Raise RequestError for an obstacle in which the curve begins or a key lies."""

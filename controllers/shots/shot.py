@@ -11,11 +11,13 @@ from dataclasses import dataclass, replace
 from functools import reduce
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from controllers.common.character import Character
 from controllers.inbetweening.pipeline import fill
-from controllers.shots.constraints import Constraint, check_constraints, describe_conflicts
-from controllers.shots.footsteps import Footstep, find_footsteps
+from controllers.shots.constraints import Constraint, check_keys, check_walk, describe_conflicts
+from controllers.shots.footsteps import Footstep, find_footsteps, lower_by
 from controllers.shots.reaching import (
     MetPose,
     ReachTargets,
@@ -108,11 +110,12 @@ def solve_shot(
     limb_keys = as_reaches(request.poses, trajectory, rest)
     poses = tuple(key for key in request.poses if not key.joints)
     request = replace(request, reaches=(*request.reaches, *limb_keys), poses=poses)
-    check_reaches(request.reaches, trajectory, rest)
-    trajectory = bend_toward_keys(trajectory, request, rest)
+    level = request if request.ground is None else request.lower_targets(_find_rise(request.ground, trajectory))
+    check_reaches(level.reaches, trajectory, rest)
+    trajectory = bend_toward_keys(trajectory, level, rest)
     if slows_in_corners(request, trajectory.curve):
         settings = replace(settings, footing=replace(settings.footing, heels=None))
-    reach = ReachTargets.of(request.reaches, len(trajectory.speeds) + (OVERLAP if request.loop else 0))
+    reach = ReachTargets.of(level.reaches, len(trajectory.speeds) + (OVERLAP if request.loop else 0))
     pieces, walked, outcome = walk_spans(
         prior,
         request,
@@ -129,23 +132,32 @@ def solve_shot(
         progress=progress,
         deadline=None if deadline_seconds is None else time.monotonic() + deadline_seconds,
     )
-    motion, reaches, met = pieces[0].motion, request.reaches, ()
+    flat, stepped, reaches, met = pieces[0].motion, None, request.reaches, ()
     if inbetweener is not None:
         joined = join_pieces(pieces, trajectory, inbetweener, request.footsteps)
-        motion = _finish_ends(joined, request, trajectory, inbetweener)
-        motion, reaches, met = _meet_keys(motion, request, trajectory, inbetweener)
+        flat = _finish_ends(joined, request, trajectory, inbetweener)
+    motion = flat
+    if request.ground is not None:
+        stepped = step_onto_ground(flat, request.ground, character.toe_rest_height)
+        motion = stepped.motion
+    if inbetweener is not None:  # which knows motion over a floor alone
+        rise = (motion.root_position - flat.root_position)[:, 1]
+        level, settled, met = _meet_keys(lower_by(motion, rise), request.lower_targets(rise), trajectory, inbetweener)
+        motion = lower_by(level, -rise)
+        reaches = tuple(replace(key, seconds=one.seconds) for key, one in zip(request.reaches, settled, strict=True))
+    flat = motion if stepped is None else flat
     notes = [trajectory.note] if trajectory.note else []
     if request.walks_only:
         if request.speed is not None:
             notes += check_path(trajectory.curve, trajectory.arcs, limits)
-        notes += check_tracking(motion, trajectory.curve)
+        notes += check_tracking(flat, trajectory.curve)
     trajectory = trajectory.slice(motion.num_frames)
-    constraints = check_constraints(replace(request, reaches=reaches), trajectory, motion, met)
+    found = replace(request, reaches=reaches)
+    constraints = (*check_walk(found, trajectory, flat), *check_keys(found, motion, met))
     notes += describe_conflicts(constraints, trajectory, motion)
-    footing, footsteps = None, find_footsteps(motion)
-    if request.ground is not None:
-        stepped = step_onto_ground(motion, request.ground, character.toe_rest_height)
-        motion, footing, footsteps = stepped.motion, stepped.measure_footing(), stepped.footsteps
+    footing, footsteps = None, find_footsteps(flat)
+    if stepped is not None:
+        footing, footsteps = replace(stepped, motion=motion).measure_footing(), stepped.footsteps
         notes += footing.notes
     return ShotSolution(
         motion,
@@ -161,6 +173,10 @@ def solve_shot(
         footing=footing,
         footsteps=tuple(footsteps),
     )
+
+
+def _find_rise(ground: Ground, trajectory: Trajectory) -> Float[Tensor, " frames"]:
+    return ground.height(trajectory.curve.ground_point(trajectory.arcs))
 
 
 def _finish_ends(

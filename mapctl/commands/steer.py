@@ -11,6 +11,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 import priors
 from controllers.common.character import Character
+from controllers.shots.uneven import step_onto_ground
 from controllers.steering import steer
 from controllers.steering.arrival import Arriver
 from controllers.steering.loop import (
@@ -33,6 +34,7 @@ from mapctl.commands.shared.outputs import show_progress
 from mapctl.curves.obstacles import Obstacle, measure_clearance
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
+from mapctl.ground import Ground
 from mapctl.intent.steering import CommandTrack, SteeringLimits, read_commands
 from mapctl.motion import join_licences
 from mapctl.problem.solution import Outcome, Solution, Status
@@ -70,6 +72,9 @@ class Steer(ModelCommand, options.ReadOptions, streaming.StreamOptions):
     liveliness: options.Liveliness = steer.SteerSettings.liveliness
     avoid: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="X,Z,RADIUS")] = ()
     """A disc on the ground to walk around, metres; may be given several times."""
+    ground: options.MaybeFile = None
+    """TOML file of the ground, where it is not flat (see `mapctl follow --help`): feet are put onto it when the script
+    has been played, so it goes without --stream."""
     seed: options.Count = 0
     """Seed of the first pose, and of what is drawn for walks."""
     acceleration: options.Number = SteeringLimits.acceleration
@@ -114,7 +119,10 @@ def run(command: Steer) -> int:
     outputs.check_files(options.collect_paths(command.out, command.report))
     if command.stream is not None and not command.realtime:
         raise RequestError("--stream goes by the clock, which needs --realtime; give both")
+    if command.stream is not None and command.ground is not None:
+        raise RequestError("--stream sends frames before they are put onto --ground; leave one out")
     streaming.check(command)
+    ground = None if command.ground is None else Ground.read(command.ground)
     track = _read_track(command)
     character, prior = read_character(command.rig, command), priors.load(command.prior)
     track, lowered = track.limit_speed(prior.limits.max_steering_speed)
@@ -133,7 +141,10 @@ def run(command: Steer) -> int:
     finally:
         if stream is not None:
             stream.close()
-    motion = recorder.motion(frames)
+    motion, footing = recorder.motion(frames), None
+    if ground is not None:
+        stepped = step_onto_ground(motion, ground, character.toe_rest_height)
+        motion, footing = stepped.motion, stepped.measure_footing()
     outputs.save_motion(character.on_rig(motion), command.out)
     starts = [time for time in track.times[1:] if time < motion.seconds]
     timing: dict[str, Any] = {**summarise_step_timing(records, starts), "peak_memory_mb": report.peak_memory_mb()}
@@ -141,7 +152,7 @@ def run(command: Steer) -> int:
         timing["stream"] = asdict(stream.statistics)
     late, sent_late = timing["late_frames"], timing.get("stream", {}).get("late", 0)
     judged = recorder.judge(track, frames)
-    notes = [*lowered, *judged["misses"]]
+    notes = [*lowered, *judged["misses"], *(() if footing is None else footing.notes)]
     notes += [f"{late} frames came after they were due"] if late else []
     notes += [f"{sent_late} frames were sent late"] if sent_late else []
     outcome = Outcome.INTERRUPTED if motion.num_frames < frames else Outcome.DONE
@@ -155,13 +166,15 @@ def run(command: Steer) -> int:
         prior={"name": prior.name, "licence": prior.card.licence, "quality": prior.card.quality},
         timing=timing,
     )
-    found |= judged
+    found |= judged | ({} if footing is None else {"footing": footing.as_row()})
     if command.report is not None:
         report.write_report(outputs.add_licence(found), command.report)
     if not command.quiet:
         files = options.collect_paths(command.out, command.report)
         streamed = None if stream is None else streaming.summarise(stream)
         print("\n".join(_format_summary(found, files, streamed)))
+        if footing is not None:
+            print(f"ground    {footing.text}")
     return conclude(status, strict=command.strict)
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import priors
-from controllers.shots.constraints import check_constraints
+from controllers.shots.constraints import check_walk
 from controllers.shots.footsteps import (
     Displacement,
     Footstep,
@@ -156,7 +156,7 @@ def test_a_displacement_without_steps_does_not_hold(rest):
     root = rest.root_position.expand(frames, 3).clone()
     root[:, 2] += trajectory.arcs
     slid = replace(rest, root_position=root, local_quat_xyzw=rest.local_quat_xyzw.expand(frames, -1, 4))
-    found = {one.name: one for one in check_constraints(request, trajectory, slid)}
+    found = {one.name: one for one in check_walk(request, trajectory, slid)}
     assert not found["feet"].holds
     assert found["feet"].got > 40
     assert found["acceleration"].holds

@@ -13,7 +13,7 @@ from helpers import generator, walk
 import controllers
 import priors
 from controllers.common.character import Character
-from controllers.shots.constraints import check_constraints
+from controllers.shots.constraints import check_walk
 from controllers.shots.reaching import build_rest_pose, measure_look_errors, turn_heads
 from controllers.shots.request import Lead, Look, Others, Reach, ShotRequest
 from controllers.shots.seams import compute_artefact_cost
@@ -217,7 +217,7 @@ def test_the_gait_of_a_label_is_a_constraint(label, holds):
     request = ShotRequest(LINE, labels=(label,))
     trajectory = plan_trajectory(request)
     motion = walk(len(trajectory.speeds))  # its toes slide: none is planted most of the time, as in a run
-    found = [one for one in check_constraints(request, trajectory, motion) if one.name.startswith("gait")]
+    found = [one for one in check_walk(request, trajectory, motion) if one.name.startswith("gait")]
     assert [constraint.holds for constraint in found] == holds
 
 
