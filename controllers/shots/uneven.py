@@ -16,7 +16,6 @@ import numpy as np
 import scipy
 import torch
 from jaxtyping import Bool, Float
-from numpy import ndarray
 from torch import Tensor
 
 from controllers.shots.footsteps import Footstep, bend_legs, find_ankles
@@ -439,7 +438,10 @@ def _stretch_over(
     straight = torch.lerp(over.new_tensor(one.height), over.new_tensor(other.height), at / length)
     over += torch.where(over > straight + EDGE / 2, CLEARANCE, 0.0)
     over[0], over[-1] = one.height, other.height
-    knots = _find_hull(at.numpy(), over.numpy())
+    low = float(over.min()) - 1
+    beneath = at.new_tensor([[0.0, low], [length, low]])
+    hull = scipy.spatial.ConvexHull(torch.cat([torch.stack([at, over], dim=1), beneath]).numpy()).vertices
+    knots = np.sort(hull[hull < len(at)])  # from the first to the last over all others
     along, high = at[knots].numpy(), over[knots].numpy()
     arcs = np.concatenate([[0.0], np.hypot(np.diff(along), np.diff(high)).cumsum()])
     forward, up = (share.new_tensor(np.interp(share.numpy() * arcs[-1], arcs, axis)) for axis in (along, high))
@@ -456,19 +458,6 @@ def _is_blocked(one: Foothold, other: Foothold, ground: Ground, sole: Sole) -> b
         for hold in (one, other)
     ]
     return float(torch.stack(rises).max()) > EDGE
-
-
-def _find_hull(x: Float[ndarray, " n"], y: Float[ndarray, " n"]) -> list[int]:
-    """Find the points on the least concave curve over all, from the first to the last (Andrew 1979)."""
-    hull = list[int]()
-    for new in range(len(x)):
-        while len(hull) > 1:
-            one, last = hull[-2:]
-            if (x[last] - x[one]) * (y[new] - y[one]) < (y[last] - y[one]) * (x[new] - x[one]):
-                break
-            hull.pop()
-        hull.append(new)
-    return hull
 
 
 def _is_near_edge(points: Float[Tensor, "*batch 3"], ground: Ground) -> tuple[Tensor, Tensor]:

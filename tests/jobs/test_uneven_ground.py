@@ -2,17 +2,22 @@
 
 import json
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
+import torch
 from helpers import generator, run
 
 import controllers
 import priors
-from controllers.shots.request import Reach, ShotRequest
+from controllers.denoising.trajectory import correct_trajectory
+from controllers.shots.request import PoseKey, Reach, ShotRequest
+from controllers.shots.shot import solve_shot
+from controllers.shots.stairs import Stairs
 from controllers.shots.trajectory import plan_trajectory
-from controllers.shots.uneven import Stairs, step_onto_ground
-from mapctl import curves
+from controllers.shots.uneven import step_onto_ground
+from mapctl import curves, rotations
 from mapctl.errors import RequestError
 from mapctl.ground import Ground
 from mapctl.intent.path import SpeedProfile
@@ -112,7 +117,8 @@ def test_hips_rise_with_the_ground_without_a_jolt(walked):
 
 
 def test_a_flat_ground_changes_neither_feet_nor_hips(walk_motion):
-    done, footing, _ = step_onto_ground(walk_motion, Ground(), TOE_REST_HEIGHT)
+    stepped = step_onto_ground(walk_motion, Ground(), TOE_REST_HEIGHT)
+    done, footing = stepped.motion, stepped.measure_footing()
     kept = [0, *CANONICAL.indices(TOES)]
     apart = (done.joint_positions() - walk_motion.joint_positions())[:, kept].norm(dim=-1)
     assert float(apart.max()) < 0.002
@@ -127,7 +133,7 @@ def walk_motion():
 def test_what_the_density_does_not_know_is_named(walk_motion, tmp_path):
     steep = tmp_path / "steep.toml"
     steep.write_text("[[ramps]]\nstart = [0, -1]\nend = [0, 3]\nheights = [0, 1.6]\nwidth = 9.0")
-    _, footing, _ = step_onto_ground(walk_motion, Ground.read(steep), TOE_REST_HEIGHT)
+    footing = step_onto_ground(walk_motion, Ground.read(steep), TOE_REST_HEIGHT).measure_footing()
     assert math.degrees(footing.steepest) == pytest.approx(math.degrees(math.atan(0.4)), abs=0.1)
     assert len(footing.notes) == 1
     assert "22 degrees" in footing.notes[0]
@@ -152,10 +158,72 @@ def test_terms_of_stairs_hold_on_them_alone(path):
     assert stairs.terms(trajectory, 0, 34) == Stairs.find(trajectory.curve, None).terms(trajectory, 150, 34) == ()
 
 
-def test_keys_on_a_ground_are_refused(path):
-    reach = Reach(1.0, {"leftHand": (0.3, 1.2, 1.0)})
-    with pytest.raises(RequestError, match="no keys"):
-        ShotRequest(curves.line(length=3), reaches=(reach,), ground=Ground.read(path))
+def test_hands_reach_over_the_ground(path):
+    target, ground = (0.35, 1.5, 2.9), Ground.read(path)
+    request = ShotRequest(curves.line(length=3), reaches=(Reach(3.0, {"leftHand": target}),), ground=ground)
+    transformer = priors.load_inbetweener("transformer")
+    done = solve_shot(priors.load("locomotion"), transformer, request, generator=generator(0))
+    hand = done.motion.joint_positions()[90, CANONICAL.index("leftHand")]
+    assert float((hand - hand.new_tensor(target)).norm()) < 0.01
+    assert next(one for one in done.constraints if one.name.startswith("leftHand")).holds
+    assert done.footing is not None
+    assert done.footing.penetration < 0.01
+
+
+def test_poses_on_a_ground_are_refused(path):
+    with pytest.raises(RequestError, match="no poses"):
+        ShotRequest(curves.line(length=3), poses=(PoseKey(1.0, facing_deg=20.0),), ground=Ground.read(path))
+
+
+def measure_depth(motion, ground):
+    """The deepest that a toe joint is, beyond its height at rest."""
+    toes = motion.joint_positions()[:, list(CANONICAL.indices(TOES))].double()
+    return float((ground.height(toes[..., ::2]) + TOE_REST_HEIGHT - toes[..., 1]).max())
+
+
+def test_keys_that_stand_on_stairs_are_met_and_the_motion_between_them_is_over_the_ground(walked, path):
+    ground, frames = Ground.read(path), [*range(0, walked.motion.num_frames - 20, 40), walked.motion.num_frames - 1]
+    model, keys = priors.load_inbetweener("transformer"), controllers.Keys.of(frames)
+    flat, done = (controllers.tween(walked.motion, keys, model, ground=under) for under in (None, ground))
+    assert torch.equal(done.motion.root_position[frames], walked.motion.root_position[frames])
+    turned = rotations.turns_between(done.motion.local_quat_xyzw, walked.motion.local_quat_xyzw)
+    assert float(turned[frames].abs().max()) < 1e-6
+    away = [one.motion.joint_positions() - walked.motion.joint_positions() for one in (flat, done)]
+    assert float(away[1].norm(dim=-1).mean()) < 0.8 * float(away[0].norm(dim=-1).mean())
+    assert measure_depth(done.motion, ground) < 0.06 < 0.15 < measure_depth(flat.motion, ground)
+    assert done.footing is not None
+    assert done.footing.penetration < 0.02
+
+
+def test_only_whole_poses_stand_on_a_ground(walk_motion, path):
+    keys = controllers.Keys.of([0, 20, 40], root_only=True)
+    with pytest.raises(RequestError, match="whole poses"):
+        controllers.tween(walk_motion, keys, priors.load_inbetweener("transformer"), ground=Ground.read(path))
+
+
+def test_hips_that_drift_are_brought_back_onto_the_ground(walked, path):
+    truth = walked.motion.root_position
+    seconds = torch.arange(len(truth), dtype=torch.float64)[:, None] / 30
+    drift = 0.05 * torch.sin(seconds * torch.tensor([6.3, 8.1, 7.2]) + torch.tensor([0.0, 1.0, 2.0]))
+    capture = replace(walked.motion, root_position=truth + drift)
+    found = correct_trajectory(capture, ground=Ground.read(path))
+    assert found.from_video
+    assert float((found.motion.root_position - truth)[:, 1].std()) < 0.5 * float(drift[:, 1].std())
+    assert float((found.motion.root_position - truth)[:, ::2].abs().mean()) < float(drift[:, ::2].abs().mean())
+    on_floor = correct_trajectory(capture).motion.root_position
+    assert float((on_floor - truth)[:, 1].abs().max()) > 0.3
+
+
+def test_commands_refuse_what_a_ground_does_not_go_with(path, tmp_path, capsys):
+    script, out = tmp_path / "commands.csv", tmp_path / "out.bvh"
+    script.write_text("time_s,speed_mps,heading_deg\n0,0.8,0\n2,0.8,0\n")
+    assert run("steer", script, "-o", out, "--ground", path, "--report", out.with_suffix(".json")) == 0
+    assert "ground    swing" in capsys.readouterr().out
+    assert json.loads(out.with_suffix(".json").read_text())["footing"]["penetration_max_cm"] < 2
+    assert run("steer", script, "-o", out, "--ground", path, "--stream", "127.0.0.1:39539", "--realtime") == 2
+    assert "leave one out" in capsys.readouterr().err
+    assert run("denoise", "example:noisy-walk", "-o", out, "--ground", path, "--capture", "studio") == 2
+    assert "captures from video" in capsys.readouterr().err
 
 
 def test_the_command_reports_how_feet_stand(path, tmp_path, capsys):
