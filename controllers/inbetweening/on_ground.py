@@ -12,7 +12,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from controllers.shots.footsteps import bend_legs, find_ankles, lower_by
 from controllers.shots.uneven import Footing, Sole, SteppedMotion, find_feet, find_slope, fit_planes, step_onto_ground
 from mapctl import rotations
 from mapctl.errors import RequestError
@@ -24,6 +23,7 @@ from mapctl.numerics.smooth_offsets import interpolate_offsets, interpolate_turn
 from mapctl.recording.fusion import transfer_change
 from mapctl.retarget import RigMap, as_rig, from_canonical, to_canonical
 from mapctl.retarget.character import TOES, Stance, rotate_foot_frames
+from mapctl.retarget.legs import bend_legs, find_ankles, lower_by
 
 _FADE_SECONDS = 0.3  # over which a correction at a key fades
 

@@ -18,17 +18,17 @@ from mapctl import contacts, kinematics, rotations
 from mapctl.curves import Curve
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
-from mapctl.kinematics import inverse
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
 from mapctl.numerics.easing import smootherstep
 from mapctl.numerics.intervals import true_intervals
-from mapctl.skeleton import CANONICAL, FEET, LIMBS, TOES, Skeleton, leg_length
+from mapctl.retarget.character import HIP_JOINTS, LEGS, limb_lengths
+from mapctl.retarget.legs import FREE_EXTENSION, bend_legs, find_ankles, find_missing_length, lower_by
+from mapctl.skeleton import CANONICAL, FEET, TOES, leg_length
 from mapctl.terms import Keyframe
 
 SIDES = ("left", "right")
 """Names of the feet, in the order of their numbers."""
-_LEGS = [LIMBS[name] for name in FEET]
 SWING, BOTH = 13, 4  # frames at PRIOR_FPS of a swing, and of double support before and after it
 STEP, _TURN = 0.7, math.radians(75.0)  # of legs' length, and radians, that a foot is put ahead of the other at most
 _SLOWEST = 45  # frames of a step at most: where there is more time, there are more steps
@@ -241,7 +241,6 @@ _CLEARANCE = 0.035  # metres of the toe in mid-swing over its rest height, as of
 _TOE_OFF, _TOE_OFF_METRE = math.radians(35.0), math.radians(60.0)  # pitch of a foot as it leaves, at most and per metre
 _ROLL = 6  # frames over which a heel rises while the toe stands, where there are as many
 _SWAY = 0.02  # metres by which hips go aside to the foot that stands
-_STRETCHED = 0.985  # share of a leg's length at which its hip goes lower
 _SMOOTH = 3.0  # frames (sigma) over which hips follow their support
 
 
@@ -364,56 +363,12 @@ def stand_on(motion: Motion, toes: Float[Tensor, "frames 2 3"], turns: Float[Ten
     """Bring the feet of a motion to positions of the toe joints and rotations in the world; hips go lower where a leg
     does not reach, but for the first and the last frame."""
     ankles = find_ankles(motion.skeleton, toes, turns)
-    lower = find_lowering(motion, ankles, keeps_ends=True)
+    at_ends = (ankles - motion.joint_positions()[:, HIP_JOINTS])[[0, -1]].norm(dim=-1).amax(dim=0)
+    straight = (at_ends / limb_lengths(motion.skeleton, LEGS)).clamp_min(FREE_EXTENSION)
+    lower = find_missing_length(motion, ankles, straight)[0].clamp_min(0).amax(dim=1)
     lower = torch.nn.functional.max_pool1d(lower[None], 9, 1, 4)[0]
     lower[[0, -1]] = 0.0
-    motion = bend_legs(lower_by(motion, _smooth_between(lower)), ankles, turns)
-    return replace(motion, local_quat_xyzw=rotations.make_sign_continuous(motion.local_quat_xyzw))
-
-
-def find_ankles(
-    skeleton: Skeleton, toes: Float[Tensor, "frames 2 3"], turns: Float[Tensor, "frames 2 4"]
-) -> Float[Tensor, "frames 2 3"]:
-    """Find the ankles of feet with toe joints at positions, metres, and rotations in the world."""
-    offsets = skeleton.offsets[list(CANONICAL.indices(TOES))].to(toes)
-    return toes - rotations.rotate(turns, offsets.expand_as(toes))
-
-
-def find_lowering(
-    motion: Motion, ankles: Float[Tensor, "frames 2 3"], *, keeps_ends: bool = False
-) -> Float[Tensor, " frames"]:
-    """Find by how much hips are too high for legs, hardly bent, to reach ankles, metres; legs that are straighter in
-    the first or the last frame may be so throughout where `keeps_ends`."""
-    positions, lower = motion.joint_positions(), torch.zeros(motion.num_frames, dtype=torch.float64)
-    for foot, limb in enumerate(_LEGS):
-        away = positions[:, limb.upper] - ankles[:, foot]
-        reached = _STRETCHED * limb.length(motion.skeleton)
-        if keeps_ends:
-            reached = max(reached, *away[[0, -1]].norm(dim=-1).tolist())
-        highest = (reached**2 - away[:, ::2].square().sum(dim=-1)).clamp_min(0).sqrt()
-        lower = torch.maximum(lower, away[:, 1] - highest)
-    return lower
-
-
-def lower_by(motion: Motion, lower: Float[Tensor, " frames"]) -> Motion:
-    """Lower a motion by so many metres."""
-    return replace(motion, root_position=motion.root_position - torch.stack([0 * lower, lower, 0 * lower], dim=-1))
-
-
-def bend_legs(motion: Motion, ankles: Float[Tensor, "frames 2 3"], turns: Float[Tensor, "frames 2 4"]) -> Motion:
-    """Bend legs so that ankles are at positions, metres, and feet have these rotations, world; thighs turn as little as
-    it takes."""
-    positions, world, quats = motion.joint_positions(), motion.joint_rotations(), motion.local_quat_xyzw.clone()
-    for foot, limb in enumerate(_LEGS):
-        aim, offsets = ankles[:, foot] - positions[:, limb.upper], motion.skeleton.offsets.to(positions)
-        bend = rotations.to_rotation_vector(quats[:, limb.lower])
-        bend[:, 0] = bend[:, 0].clamp_min(0)  # a leg that is straight bends forward again, not backward
-        quats[:, limb.lower] = rotations.from_rotation_vector(bend)
-        turn, bent = inverse.reach(limb, world[:, limb.upper], quats[:, limb.lower], aim, offsets)
-        quats[:, limb.upper] = rotations.multiply(rotations.inverse(world[:, 0]), turn)
-        quats[:, limb.lower] = bent
-        quats[:, limb.end] = rotations.multiply(rotations.inverse(rotations.multiply(turn, bent)), turns[:, foot])
-    return replace(motion, local_quat_xyzw=quats)
+    return bend_legs(lower_by(motion, _smooth_between(lower)), ankles, turns)
 
 
 _FASTEST_LANDING = 7  # frames that a swing under way still takes at least

@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controllers.inbetweening.pipeline import fill
-from controllers.shots.footsteps import bend_legs
 from controllers.shots.request import STANDING_SPEED, Look, PoseKey, Reach, ShotRequest
 from controllers.shots.seams import Filling, choose_filling
 from controllers.shots.trajectory import Trajectory, bend_trajectory
@@ -30,6 +29,7 @@ from mapctl.numerics.intervals import true_intervals, widen
 from mapctl.pose import decode
 from mapctl.protocols import Density, Inbetweener
 from mapctl.recording.masks import MissingMask
+from mapctl.retarget.legs import bend_legs
 from mapctl.skeleton import CANONICAL, FEET, LIMBS, TOES, Skeleton
 from mapctl.terms import WithinReach
 

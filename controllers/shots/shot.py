@@ -17,7 +17,7 @@ from torch import Tensor
 from controllers.common.character import Character
 from controllers.inbetweening.pipeline import fill
 from controllers.shots.constraints import Constraint, check_keys, check_walk, describe_conflicts
-from controllers.shots.footsteps import Footstep, find_footsteps, lower_by
+from controllers.shots.footsteps import Footstep, find_footsteps
 from controllers.shots.reaching import (
     MetPose,
     ReachTargets,
@@ -45,6 +45,7 @@ from mapctl.intent.path import SpeedProfile, TimedSpeed, walk_at_ease
 from mapctl.motion import Motion
 from mapctl.problem.solution import Ledger, Solution, Status
 from mapctl.protocols import Density, Inbetweener
+from mapctl.retarget.legs import lower_by
 from mapctl.runtime.stepwise import Progress
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.terms import Term

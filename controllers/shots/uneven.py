@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from controllers.shots.footsteps import Footstep, bend_legs, find_ankles
+from controllers.shots.footsteps import Footstep
 from mapctl import contacts, kinematics, rotations
 from mapctl.features import PRIOR_FPS
 from mapctl.ground import Ground
@@ -27,8 +27,8 @@ from mapctl.numerics import gaussian
 from mapctl.numerics.easing import smootherstep
 from mapctl.numerics.intervals import true_intervals
 from mapctl.numerics.smooth_offsets import smooth_between
-from mapctl.retarget.carry import lower_hips
 from mapctl.retarget.character import LEGS, limb_extension
+from mapctl.retarget.legs import bend_legs, find_ankles, lower_hips
 from mapctl.skeleton import CANONICAL, FEET, TOES, find_heels
 
 STEEPEST = math.radians(15.0)
@@ -263,9 +263,7 @@ def step_onto_ground(motion: Motion, ground: Ground, rest_height: float, *, keys
     root[:, 1] += gaussian.smooth(torch.stack([track.height for track in tracks]).mean(dim=0), sigma)
     ankles = find_ankles(motion.skeleton, torch.stack(toes, dim=1), turns)
     lowered = lower_hips(replace(motion, root_position=root), ankles, limb_extension(motion, LEGS))
-    done = bend_legs(lowered, ankles, turns)
-    done = replace(done, local_quat_xyzw=rotations.make_sign_continuous(done.local_quat_xyzw))
-    return SteppedMotion(done, motion, ground, soles, holds, tracks)
+    return SteppedMotion(bend_legs(lowered, ankles, turns), motion, ground, soles, holds, tracks)
 
 
 def _find_footholds(motion: Motion) -> list[Foothold]:

@@ -7,12 +7,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from controllers.shots.footsteps import bend_legs, find_ankles, find_lowering, lower_by
 from mapctl import rotations
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode
 from mapctl.motion import Motion
 from mapctl.numerics.easing import smootherstep
 from mapctl.pose import BodyPose
+from mapctl.retarget.character import LEGS, limb_extension
+from mapctl.retarget.legs import bend_legs, find_ankles, lower_hips
 from mapctl.skeleton import CANONICAL, FEET, TOES, Skeleton
 
 
@@ -84,4 +85,4 @@ def _feet(pose: Motion) -> Float[Tensor, "2 4"]:
 def _stand_on(body: Motion, toes: Float[Tensor, "frames 2 3"], feet: Float[Tensor, "frames 2 4"]) -> Motion:
     """Bring the feet of a body to positions of the toe joints and world rotations; hips are as low as legs need."""
     ankles = find_ankles(body.skeleton, toes, feet)
-    return bend_legs(lower_by(body, find_lowering(body, ankles)), ankles, feet)
+    return bend_legs(lower_hips(body, ankles, limb_extension(body, LEGS)), ankles, feet)

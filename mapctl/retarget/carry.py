@@ -42,6 +42,7 @@ from mapctl.retarget.character import (
     rotate_foot_frames,
 )
 from mapctl.retarget.hands import Spans, hold_through, keep_hand_relations, mean_by_span, merge_contacts, soft_clamp
+from mapctl.retarget.legs import MAX_EXTENSION, fit_hips, lower_hips
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import Skeleton, leg_length
 
@@ -116,16 +117,7 @@ class RetargetedMotion:
         return tuple(found)
 
 
-_FREE_EXTENSION = 0.985  # of the leg: a leg may be that straight, whatever the source's is
-_MAX_EXTENSION = 0.9995  # of the leg: how straight one may be at most
-_HIP_FIT_SECONDS = 0.06  # seconds over which the height of hips is smoothed
-_HIP_DROP_SECONDS = 0.12  # seconds over which hips go down for a leg that is too short, and up again
 _SMOOTH_SECONDS = 0.05  # seconds over which what hips carry is smoothed
-# Of the leg's length, from where on a leg is so straight that the hips' height begins to matter to it, and does fully.
-_STRAIGHT_SHARES = (0.93, 0.985)
-# Of the leg's length, how far down a foot is from which the hips' height begins to matter to it, and matters fully.
-_DOWN_SHARES = (0.5, 0.8)
-_LEAST_INFLUENCE = 0.02  # of both legs together, below which the hips' height is left to the trajectory
 _UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 _SOFT_MARGIN = 0.004  # of the leg, before the most that it may be, over which it gives in
 _HEEL_DEG, _MAX_HEEL_DEG = 10.0, 60.0  # degrees that toes are raised by when a foot is on its heel, and at most
@@ -193,41 +185,6 @@ def _transfer_root(
     return replace(own, skeleton=body.leveled, root_position=scale * own.root_position + rise - aside, source=None)
 
 
-def fit_hips(moved: Motion, ankles: Float[Tensor, "frames 2 3"], stretch: Float[Tensor, "frames 2"]) -> Motion:
-    """Raise or lower hips smoothly until legs that reach the ankles' targets are as straight as the source's.
-
-    This has an inverse, so that a clip that goes to another body and back has its hips where they were.
-    """
-    short, down = _find_missing_length(moved, ankles, stretch.clamp(max=_MAX_EXTENSION))
-    begin, end = _DOWN_SHARES
-    bent, straight = _STRAIGHT_SHARES
-    influence = smootherstep((stretch - bent) / (straight - bent)) * smootherstep((down - begin) / (end - begin))
-    total = influence.sum(dim=-1, keepdim=True)
-    lower = (influence * short).sum(dim=-1, keepdim=True) / (total + _LEAST_INFLUENCE)
-    dip = gaussian.smooth(lower, _HIP_FIT_SECONDS * float(moved.fps))
-    return replace(moved, root_position=moved.root_position - dip * _UP)
-
-
-def lower_hips(moved: Motion, ankles: Float[Tensor, "frames 2 3"], stretch: Float[Tensor, "frames 2"]) -> Motion:
-    """Lower hips smoothly until legs reach the ankles' targets no straighter than the source's, or than most."""
-    short, down = _find_missing_length(moved, ankles, stretch.clamp(_FREE_EXTENSION, _MAX_EXTENSION))
-    # A leg that points sideways or up is not helped by lower hips.
-    short = torch.where(down > _DOWN_SHARES[0], short.clamp_min(0), 0.0).amax(dim=-1, keepdim=True)
-    dip = gaussian.envelope(short, _HIP_DROP_SECONDS, float(moved.fps))
-    return replace(moved, root_position=moved.root_position - dip * _UP)
-
-
-def _find_missing_length(
-    moved: Motion, ankles: Float[Tensor, "frames 2 3"], extension: Float[Tensor, "frames 2"]
-) -> tuple[Float[Tensor, "frames 2"], Float[Tensor, "frames 2"]]:
-    """Return by how much the hips are too high for a leg of this extension to reach its ankle's target, metres, and how
-    far down that is, of this leg's length."""
-    to_ankles = ankles - moved.joint_positions()[:, HIP_JOINTS]
-    most = limb_lengths(moved.skeleton, LEGS) * extension
-    level, down = to_ankles[..., ::2].square().sum(-1), -to_ankles[..., 1]
-    return down - (most.square() - level).clamp_min(0).sqrt(), down / most
-
-
 def _find_ankle_targets(
     own: Motion,
     moved: Motion,
@@ -281,7 +238,7 @@ def _foot_length_offset(own: Motion, moved: Motion, scale: float) -> Float[Tenso
 def reach_ankle_targets(moved: Motion, ankles: Float[Tensor, "frames 2 3"]) -> Motion:
     """Bend and rotate legs so that ankles reach their targets; feet keep their orientation in the world."""
     positions, world = moved.joint_positions().clone(), moved.joint_rotations()
-    at, most = positions[:, HIP_JOINTS], _MAX_EXTENSION * limb_lengths(moved.skeleton, LEGS)
+    at, most = positions[:, HIP_JOINTS], MAX_EXTENSION * limb_lengths(moved.skeleton, LEGS)
     to_ankles = ankles - at
     far = to_ankles.norm(dim=-1)
     positions[:, FEET] = at + to_ankles * (soft_clamp(far, most, _SOFT_MARGIN * most) / far.clamp_min(1e-9))[..., None]

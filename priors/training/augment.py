@@ -20,8 +20,9 @@ from mapctl.kinematics import chain_matrices
 from mapctl.motion import Motion
 from mapctl.pose import BodyPose
 from mapctl.recording import Capture
-from mapctl.retarget.carry import fit_hips, lower_hips, reach_ankle_targets
+from mapctl.retarget.carry import reach_ankle_targets
 from mapctl.retarget.character import FEET, LEGS, TOES, limb_extension
+from mapctl.retarget.legs import fit_hips, lower_hips
 from mapctl.skeleton import CANONICAL
 from priors.training.data import Corpus
 from priors.training.windows import PoseWindows

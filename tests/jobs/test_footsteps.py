@@ -13,7 +13,6 @@ from controllers.shots.footsteps import (
     Displacement,
     Footstep,
     LastSteps,
-    bend_legs,
     find_footsteps,
     hold_footsteps,
     plan_footsteps,
@@ -27,6 +26,7 @@ from mapctl import curves, rotations
 from mapctl.errors import RequestError
 from mapctl.kinematics.moving import move_to, rotate_about_vertical
 from mapctl.metrics.body import measure_glide
+from mapctl.retarget.legs import bend_legs
 from mapctl.skeleton import CANONICAL, FEET, TOES
 
 FOUR = [*CANONICAL.indices(TOES), *CANONICAL.indices(FEET)]

@@ -15,15 +15,9 @@ import mapctl
 from mapctl import contacts, retarget, rotations
 from mapctl.commands.shared import inputs
 from mapctl.motion import Motion
-from mapctl.retarget.carry import (
-    GroundMode,
-    RiggedCharacter,
-    find_ground,
-    fit_hips,
-    retarget_canonical,
-    retarget_motion,
-)
+from mapctl.retarget.carry import GroundMode, RiggedCharacter, find_ground, retarget_canonical, retarget_motion
 from mapctl.retarget.character import LEGS, limb_extension
+from mapctl.retarget.legs import fit_hips
 from mapctl.skeleton import CANONICAL, leg_length
 
 USUAL = Performer()
