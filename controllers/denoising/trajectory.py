@@ -25,7 +25,7 @@ _CORRELATION_SECONDS = 0.2  # time over which the drift's velocity is correlated
 _EVEN_SECONDS = 0.06  # the drift's velocity over its acceleration: less leaves kinks where toes land and leave
 _LEAST_DRIFT = 0.01  # m/s
 _SINK_SPEED, _SINK_HEIGHT = 0.1, 0.5  # m/s by which, and metres to which, heights drift
-_REST_RANGE = 0.06  # metres by which toes of other rigs rest higher or lower: there the capture's own height stays
+_REST_RANGE = 0.06  # metres by which toes of other rigs rest higher or lower
 _SWING_HEIGHT = 0.3  # metres over the floor within which a toe swings
 _FLOOR_SECONDS, _FLOOR_PERCENTILE = 1.2, 15  # of the lower toe's height: the floor of the first solve
 _VELOCITY_ERRORS = (0.3, 0.2, 0.12, 0.08, 0.05, 0.05)
@@ -54,7 +54,8 @@ def correct_trajectory(motion: Motion, explained: float = 0.0, ground: Ground | 
     the hips and low. The drift s is estimated from the velocity of standing toes (empirical Bayes), so that hips over
     toes that are still stay; s_0 is s over its time of correlation, and the drift x - o has an acceleration in
     proportion. Heights have w (x + f - r)^2 / s_level^2 in addition, r the height at which toes rest,
-    over the ground that was under them in the solve before.
+    over the ground that was under them in the solve before. In the end standing toes are as high as the median of what
+    was captured, where rigs' toes rest about so high.
     """
     if motion.num_frames < 3:
         return CorrectedTrajectory(motion, 0.0, from_video=False)
@@ -62,7 +63,7 @@ def correct_trajectory(motion: Motion, explained: float = 0.0, ground: Ground | 
     toes = motion.joint_positions()[:, motion.skeleton.indices(TOES)].numpy()
     about = toes - hips[:, None]
     lower = (toes[..., 1] - _find_levels(toes, ground)).min(axis=1)
-    rest = TOE_REST_HEIGHT * leg_length(motion.skeleton) / leg_length(CANONICAL)
+    usual = rest = TOE_REST_HEIGHT * leg_length(motion.skeleton) / leg_length(CANONICAL)
     window = 2 * round(_FLOOR_SECONDS * fps / 2) + 1
     floor = ndimage.percentile_filter(lower, _FLOOR_PERCENTILE, window, mode="nearest")
     if abs(np.median(floor) - rest) < _REST_RANGE:
@@ -71,7 +72,7 @@ def correct_trajectory(motion: Motion, explained: float = 0.0, ground: Ground | 
     captured = hips + np.array([0, rest - np.median(floor), 0])
     heading = rotations.split_heading(motion.local_quat_xyzw[1:, 0])[0]
     slide = rotations.rotate_ground(fps * torch.from_numpy(toes[..., [0, 2]]).diff(dim=0), -heading[:, None]).numpy()
-    drift, stands = 0.0, np.zeros(slide.shape[:2])
+    drift, stands, standing = 0.0, np.zeros(slide.shape[:2]), np.zeros(toes.shape[:2])
     for error in _VELOCITY_ERRORS:
         rests = rest + _find_levels(about + found[:, None], ground)
         standing = _weigh_standing(about, found, rests, fps, error)
@@ -84,6 +85,9 @@ def correct_trajectory(motion: Motion, explained: float = 0.0, ground: Ground | 
         levels = standing / TOE_LEVEL**2, rests[..., None] - about[..., 1:2]
         height = _solve(captured[:, 1:2], about[..., 1:2], stands, fps, (_SINK_SPEED, _SINK_HEIGHT), levels)
         found = np.stack([across[:, 0], height[:, 0], across[:, 1]], axis=1)
+    own = _weighted_median(toes[..., 1] - _find_levels(toes, ground), standing)
+    if abs(own - usual) < _REST_RANGE:
+        found[:, 1] += own - rest
     steady = np.linalg.norm((stands[..., None] * slide).sum(axis=(0, 1))) / max(float(stands.sum()), 1e-9)
     shows = stands.max(axis=1).sum() > _STANCE_SECONDS * fps and np.ptp(floor) < _LEVEL_RANGE
     corrected = replace(motion, root_position=torch.from_numpy(found).to(motion.root_position))
