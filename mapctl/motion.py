@@ -47,6 +47,12 @@ class Motion:
         if frames == 0 or self.fps <= 0:
             raise MapctlError("a motion needs at least one frame and a positive frame rate")
 
+    @staticmethod
+    def at_rest(skeleton: Skeleton) -> "Motion":
+        """Return one frame with all rotations zero and the root at the origin."""
+        still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).repeat(1, skeleton.num_joints, 1)
+        return Motion(skeleton, Fraction(30), torch.zeros(1, 3, dtype=torch.float64), still)
+
     def __str__(self) -> str:
         return f"Motion: {self.describe()}"
 

@@ -17,7 +17,6 @@ from mapctl.formats.atomic import atomic_path
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap
 from mapctl.retarget.doubts import Fit
-from mapctl.skeleton import CANONICAL
 
 _SIZE, _DPI = (16.0, 9.6), 100  # inches
 _LEFT, _RIGHT, _MIDDLE, _UNMATCHED, _DOUBT = "#4c78a8", "#f58518", "#333333", "#b5b5b5", "#d62728"
@@ -30,9 +29,8 @@ JointPositions = Float[np.ndarray, "joints 3"]
 
 def plot_rig(rigmap: RigMap, motion: Motion, fit: Fit, *, title: str, path: str | PathLike[str]) -> None:
     """Write a PNG, 1600 pixels wide, of a rig and a clip of it."""
-    still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).repeat(1, CANONICAL.num_joints, 1)
-    standing = Motion(rigmap.skeleton, motion.fps, torch.zeros(1, 3, dtype=torch.float64), still)
-    tpose = _stand_upright(retarget.from_canonical(standing, rigmap), rigmap, heading=0.0)
+    standing = retarget.from_canonical(Motion.at_rest(rigmap.skeleton), rigmap)
+    tpose = _stand_upright(standing, rigmap, heading=0.0)
     first, middle = (_place_frame(rigmap, motion, number) for number in (0, motion.num_frames // 2))
     figure = Figure(figsize=_SIZE, dpi=_DPI, facecolor="white")
     grid = figure.add_gridspec(1, 4, width_ratios=(5, 1, 1, 1), left=0.01, right=0.99, top=0.9, bottom=0.16)

@@ -36,7 +36,7 @@ Frame Time: 0.0333333
 
 def without(source: Path, out: Path, lost: Sequence[tuple[str, int, int]], *, word: str = "nan") -> Path:
     """The BVH file with a word in place of the values of channels whose label begins so, from a frame up to another."""
-    read = bvh.read_text(source)
+    read = bvh.read(source, lossy=False)[0].source
     lines = source.read_text().splitlines()
     first = next(number for number, line in enumerate(lines) if line.startswith("Frame Time")) + 1
     rows = [row.split() for row in lines[first:]]
@@ -64,7 +64,7 @@ def with_all_channels(motion: Motion, out: Path, *, seed: int | None = None) -> 
     """The motion as BVH with six channels on every joint, in Euler orders that the seed draws."""
     draw = np.random.default_rng(seed)
     motion.save(out)
-    read = bvh.read_text(out)
+    read = bvh.read(out, lossy=False)[0].source
     orders = [("Z", "X", "Y") if seed is None else tuple(draw.permutation(list("XYZ"))) for _ in motion.skeleton.names]
     channels = tuple((*bvh.POSITIONS, *(f"{axis}rotation" for axis in order)) for order in orders)
     tree = replace(read.hierarchy, channels=channels)

@@ -141,7 +141,7 @@ class Conversion:
         fps, fps_in = (None if text is None else parse_fps(text) for text in (command.fps, command.fps_in))
         body = None if command.rig in (None, "canonical") else inputs.read_rigged(command.rig)
         if command.as_ is not None:
-            body = RiggedCharacter.of(smpl.make_rest(smpl.build_skeleton(smpl.JOINTS[0])), None)[1]
+            body = RiggedCharacter.of(Motion.at_rest(smpl.build_skeleton(smpl.JOINTS[0])), None)[1]
         if command.robot is None and command.header:
             raise RequestError("--header is for the .csv of a robot; name one by --robot")
         robot = None if command.robot is None else robot_model.load(command.robot)

@@ -15,10 +15,9 @@ from mapctl.commands.shared import inputs, options, outputs
 from mapctl.commands.shared.command import ModelCommand
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
-from mapctl.formats import bvh
 from mapctl.formats.character import CharacterSource
 from mapctl.formats.marker_fit import MarkerFit
-from mapctl.formats.units import UNITS
+from mapctl.formats.units import UNITS, FileUnit
 from mapctl.retarget.doubts import assess_fit
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints, weight_sets
@@ -158,7 +157,7 @@ def _print_clip(path: Path, command: Info) -> None:
     names = motion.skeleton.names
     about: dict[str, Any] = {"licence": motion.licence} if motion.licence else {}
     about |= {
-        "metres_per_unit": bvh.unit_of(motion) or 1.0,
+        "metres_per_unit": motion.source.metres_per_unit if isinstance(motion.source, FileUnit) else 1.0,
         "num_joints": motion.num_joints,
         "frames": motion.num_frames,
         "fps": float(motion.fps),

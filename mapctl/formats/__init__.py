@@ -181,8 +181,12 @@ def _find_reader(path: str | PathLike[str]) -> ModuleType:
 
 
 def save(motion: "Motion", path: str | PathLike[str]) -> None:
-    """Write a motion in a format of `WRITERS`, whole or not at all. RequestError if it cannot be written there."""
+    """Write a motion in a format of `WRITERS`, whole or not at all. RequestError if it cannot be written there, or
+    holds a NaN."""
+    from mapctl.formats.bvh import check_finite
+
     check_ending(path)
+    check_finite(motion, path)
     import_module(f"mapctl.formats.{WRITERS[Path(path).suffix.lower()]}").save(motion, path)
 
 

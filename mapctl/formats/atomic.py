@@ -5,7 +5,7 @@ import os
 import secrets
 import stat
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from os import PathLike
 from pathlib import Path
@@ -46,12 +46,6 @@ def write_bytes(path: str | PathLike[str], content: bytes) -> None:
     """Write `content` as the whole file `path`; WriteError if that cannot be."""
     with atomic_path(path) as scratch:
         scratch.write_bytes(content)
-
-
-def write_pieces(path: str | PathLike[str], pieces: "Iterable[bytes | memoryview]") -> None:
-    """Write the pieces one after the other as the whole file `path`; WriteError if that cannot be."""
-    with atomic_path(path) as scratch, scratch.open("wb") as opened:
-        opened.writelines(pieces)
 
 
 def write_text(path: str | PathLike[str], content: str) -> None:

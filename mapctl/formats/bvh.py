@@ -266,43 +266,6 @@ _DATUM = re.compile(r"\S+", re.ASCII)  # a no-break space parts no numbers
 _FRAME_TIME = re.compile(r"\s*+frame[ \t]*+time[ \t]*+:?[ \t]*+([^\s:]+)", re.IGNORECASE)
 
 
-@dataclass(frozen=True, eq=False)
-class BvhText:
-    """Content of a BVH file."""
-
-    hierarchy: Hierarchy
-    frame_time: str
-    """Seconds of one frame, as printed."""
-    values: np.ndarray
-    """(frames, channels), file unit and degrees."""
-    encoding: str
-    """How names are encoded: utf-8 or latin-1."""
-
-
-def read_text(path: str | PathLike[str], *, lossy: bool = False) -> BvhText:
-    """Read a BVH file. FileFormatError names the line and what was expected there.
-
-    A `lossy` one may hold NaN among its values, but not only NaN.
-    """
-    text, encoding = decode(path, read_bytes(path), "BVH text")
-    scanner = Scanner(path, text)
-    hierarchy = read_hierarchy(scanner)
-    word = scanner.match(_FRAMES, "'Frames: COUNT'")
-    if not re.fullmatch(r"[+]?[0-9]{1,12}", word):
-        scanner.fail(f"expected a positive number of frames, got {shorten(word)}")
-    frames, frames_line = int(word), scanner.line
-    frame_time = scanner.match(_FRAME_TIME, "'Frame Time: SECONDS'")
-    seconds = finite_number(frame_time)
-    if seconds is None or len(frame_time) > 60 or not SHORTEST_FRAME <= seconds <= LONGEST_FRAME:
-        allowed = f"between {SHORTEST_FRAME:g} and {LONGEST_FRAME:g} s"
-        scanner.fail(f"expected a frame time {allowed}, got {shorten(frame_time)}")
-    labels = hierarchy.labels()
-    values = _parse_values(scanner, labels, frames=frames, frames_line=frames_line, lossy=lossy)
-    missing.check_any_known(path, np.isnan(values))
-    check_extent(path, len(values), len(hierarchy.names))
-    return BvhText(hierarchy, frame_time, values, encoding)
-
-
 def _parse_values(scanner: Scanner, labels: Sequence[str], *, frames: int, frames_line: int, lossy: bool) -> np.ndarray:
     """Parse the motion block as (frames, channels), in one go; only a fault is looked for by row."""
     width = len(labels)
@@ -443,12 +406,27 @@ def read(path: str | PathLike[str], *, lossy: bool) -> tuple[Motion, MissingValu
     joint that stays still is known in every frame if it is in one; if it is in none, it is at OFFSET. FileFormatError
     names what is wrong, in which line.
     """
-    text = read_text(path, lossy=lossy)
-    tree, lost = text.hierarchy, np.isnan(text.values)
-    values = _fill_missing(tree, text.values)
+    text, encoding = decode(path, read_bytes(path), "BVH text")
+    scanner = Scanner(path, text)
+    tree = read_hierarchy(scanner)
+    word = scanner.match(_FRAMES, "'Frames: COUNT'")
+    if not re.fullmatch(r"[+]?[0-9]{1,12}", word):
+        scanner.fail(f"expected a positive number of frames, got {shorten(word)}")
+    frames, frames_line = int(word), scanner.line
+    frame_time = scanner.match(_FRAME_TIME, "'Frame Time: SECONDS'")
+    seconds = finite_number(frame_time)
+    if seconds is None or len(frame_time) > 60 or not SHORTEST_FRAME <= seconds <= LONGEST_FRAME:
+        allowed = f"between {SHORTEST_FRAME:g} and {LONGEST_FRAME:g} s"
+        scanner.fail(f"expected a frame time {allowed}, got {shorten(frame_time)}")
+    own = _parse_values(scanner, tree.labels(), frames=frames, frames_line=frames_line, lossy=lossy)
+    lost = np.isnan(own)
+    missing.check_any_known(path, lost)
+    check_extent(path, len(own), len(tree.names))
+    values = _fill_missing(tree, own)
     _, rest, moving = _classify_translations(tree, values)
     unit = guess_unit(tree.names, tree.parents, rest, end_offsets=tree.end_offsets, moving=moving)
-    layout = BvhLayout(**vars(unit), **vars(text), fps=frame_rate(text.frame_time))
+    layout = BvhLayout(**vars(unit), hierarchy=tree, fps=frame_rate(frame_time), frame_time=frame_time)
+    layout = replace(layout, encoding=encoding, values=own)
     return _build_motion(layout, values), _find_missing(tree, lost, moving)
 
 
@@ -491,11 +469,6 @@ def _find_missing(tree: Hierarchy, lost: np.ndarray, moving: Sequence[int]) -> M
         if joint == 0 or joint in moving or own.all(axis=0).any():
             positions[:, joint] |= own.any(axis=1)
     return MissingValues(torch.from_numpy(rotations), torch.from_numpy(positions))
-
-
-def unit_of(motion: Motion) -> float | None:
-    """Return metres per unit of the BVH or AMC file that a motion was read from; None for other motions."""
-    return motion.source.metres_per_unit if isinstance(motion.source, FileUnit) else None
 
 
 def convert_unit(motion: Motion, metres_per_unit: float) -> Motion:
@@ -545,9 +518,8 @@ def save(motion: Motion, path: str | PathLike[str]) -> None:
     Else in centimetres, or where a body of that size would be read in another unit in metres or millimetres, with root
     OFFSET 0, six channels on the root and on joints that travel, three elsewhere. A channel is added where the source's
     layout cannot hold the motion. Same motion, same bytes.
-    RequestError where the motion holds a NaN or the file cannot be written; then nothing is written.
+    RequestError where BVH has no form for its names or frame rate; then nothing is written.
     """
-    check_finite(motion, path)
     layout = choose_layout(motion, path)
     order = [motion.skeleton.index(name) for name in layout.hierarchy.names]
     quat_xyzw = as_array(motion.local_quat_xyzw)[:, order]

@@ -14,9 +14,9 @@ from mapctl.errors import MapctlError, RequestError
 from mapctl.formats import parts
 from mapctl.formats.sandbox import Refusal
 from mapctl.formats.text import check_ordinary, warn_once
-from mapctl.formats.units import FASTEST, frame_rate
+from mapctl.formats.units import USUAL_FPS
 from mapctl.mesh.character_mesh import CharacterMesh, compute_normals, merge_meshes
-from mapctl.mesh.mannequin import build_skin, place_at_rest
+from mapctl.mesh.mannequin import build_skin
 from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton
 
@@ -25,11 +25,7 @@ STILL_METRES = 1e-5
 """A joint whose offset varies by less stays still; files of 32-bit numbers round to 1e-7 of a body."""
 NEW_NODE = -1
 """Placeholder for the node of a joint that is yet to be added to the file."""
-_DEFAULT_FPS = Fraction(30)
-_UNEVEN_SHARE = 0.02  # of a frame that a key may lie beside it
 _FARTHEST = 1e6  # metres
-_FASTEST_CODES = 240
-"""Time codes per second up to which each is a frame; more are parts of frames."""
 _LARGEST = 1e12  # whatever the unit
 _MAX_VERTICES = 2**23
 _MOST_CARRIERS = 4  # joints of a vertex, as every engine takes them
@@ -73,7 +69,7 @@ class RestFrames:
 
     def matrices(self) -> Array:
         """Return the joints' world matrices at rest, (joints, 4, 4)."""
-        return compose_matrices(self.positions, self.quat_xyzw, np.repeat(self.scales[:, None], 3, axis=1))
+        return parts.compose_matrices(self.positions, self.quat_xyzw, np.repeat(self.scales[:, None], 3, axis=1))
 
     def with_root(self, name: str) -> "RestFrames":
         """Return the same joints below a further one, which at rest is where the frame is that the root is in."""
@@ -125,63 +121,6 @@ class RestFrames:
             moved[:, joint] = rotations.rotate(back, positions[:, joint] - start) / scale
             turned[:, joint] = rotations.multiply(back, world[:, joint])
         return moved.numpy(), rotations.make_sign_continuous(turned).numpy()
-
-
-def compose_matrices(translations: Array, quat_xyzw: Array, scales: Array) -> Array:
-    """Return matrices (..., 4, 4) that scale by (..., 3), then turn by (..., 4), then move by (..., 3)."""
-    turns = rotations.to_matrix(torch.from_numpy(np.ascontiguousarray(quat_xyzw))).numpy()
-    matrices = np.zeros((*turns.shape[:-2], 4, 4))
-    matrices[..., :3, :3] = turns * scales[..., None, :]
-    matrices[..., :3, 3] = translations
-    matrices[..., 3, 3] = 1.0
-    return matrices
-
-
-def compose_transforms(transforms: Array) -> Array:
-    """Return matrices (..., 4, 4) of translation, rotation xyzw and scale (..., 10). Refusal where they are not finite,
-    or larger than 1000 km."""
-    if not np.isfinite(transforms).all() or np.abs(transforms).max(initial=0.0) > _FARTHEST:
-        raise Refusal("its animation holds numbers that are not finite, or larger than 1000 km")
-    turns = transforms[..., 3:7]
-    lengths = np.linalg.norm(turns, axis=-1, keepdims=True)
-    if lengths.min(initial=1.0) < 1e-6:
-        raise Refusal("its animation holds a rotation of length zero")
-    return compose_matrices(transforms[..., :3], turns / lengths, transforms[..., 7:])
-
-
-def sample_times(keys: np.ndarray) -> tuple[Fraction, np.ndarray]:
-    """Return frames per second and the times, seconds, at which to read an animation with keys at these times.
-
-    Keys that lie on the frames of one rate (not on all of them need one lie) give that rate; others are read at 30
-    frames a second, the last key at or before the last frame.
-    """
-    keys = np.unique(np.asarray(keys, np.float64))
-    if len(keys) < 2:
-        return _DEFAULT_FPS, keys[:1] if len(keys) else np.zeros(1)
-    fps = _find_rate(keys - keys[0])
-    count = int(np.floor((keys[-1] - keys[0]) * float(fps) + _UNEVEN_SHARE)) + 1
-    return fps, keys[0] + np.arange(count) / float(fps)
-
-
-def _find_rate(keys: np.ndarray) -> Fraction:
-    """Return the rate of which every key, from 0 on, is a frame; 30 where there is none."""
-    apart = np.diff(keys)
-    step = float(np.median(apart[apart > 0.25 * np.median(apart)]))
-    for seconds in (step, *(step / part for part in (2, 3, 4, 5)), 1 / 30, 1 / 24, 1 / 25, 1 / 60, 1 / 120):
-        if not 1 / FASTEST < seconds < 100:
-            continue
-        seconds = keys[-1] / max(1, round(keys[-1] / seconds))  # keys are rounded one by one, their whole span hardly
-        fps = frame_rate(f"{seconds:.7f}") if seconds > 1e-4 else Fraction(1 / seconds)
-        frames = keys * float(fps)
-        if np.abs(frames - np.rint(frames)).max() < _UNEVEN_SHARE:
-            return fps
-    return _DEFAULT_FPS
-
-
-def frame_rate_of(rate: float) -> Fraction:
-    """Return the exact frame rate behind a rounded floating-point one: 29.97 is 30000/1001."""
-    near = frame_rate(f"{1.0 / rate:.6f}") if 0.01 < rate < 1e4 else Fraction(rate)
-    return near if abs(float(near) / rate - 1.0) < 1e-5 else Fraction(rate).limit_denominator(10_000)
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,11 +189,15 @@ def add_root_to_character(source: object | None, name: str) -> CharacterSource |
 
 
 def character_of(motion: Motion, ending: str) -> CharacterSource | None:
-    """Return the character that a motion is of, if its file has this ending and its joints are the motion's."""
+    """Return the character that a motion is of, if its file has this ending and its joints are the motion's.
+    RequestError where the file has changed since it was read."""
     source = motion.source
     if not isinstance(source, CharacterSource) or not source.holds(motion):
         return None
-    return source if _family(source.path.suffix) == _family(ending) else None
+    if _family(source.path.suffix) != _family(ending):
+        return None
+    source.check_unchanged()
+    return source
 
 
 def _family(ending: str) -> str:
@@ -275,7 +218,7 @@ def load_motion(path: str | PathLike[str], read: Reader) -> Motion:
     """
     with parts.names_file(path):
         found, frames, skeleton, source = _read(path, read, "motion")
-        fps, worlds = found.motion or _place_poses(found) or (_DEFAULT_FPS, frames.matrices()[None])
+        fps, worlds = found.motion or (USUAL_FPS, frames.matrices()[None])
         return replace(frames.to_motion(worlds, fps, skeleton, source), licence=found.licence)
 
 
@@ -283,7 +226,7 @@ def load_rest(path: str | PathLike[str], read: Reader) -> Motion:
     """Read one frame of the rest pose, as `load_motion` reads an animation."""
     with parts.names_file(path):
         _, frames, skeleton, source = _read(path, read, "rest")
-        return frames.to_motion(frames.matrices()[None], _DEFAULT_FPS, skeleton, source)
+        return frames.to_motion(frames.matrices()[None], USUAL_FPS, skeleton, source)
 
 
 def load_mesh(path: str | PathLike[str], read: Reader) -> CharacterMesh:
@@ -309,59 +252,6 @@ def _read(
     rests = frames.matrices()
     tips = {joint: (rests[joint] @ end)[:3, -1] for joint, end in found.ends.items()}
     return found, frames, frames.skeleton(tips), CharacterSource.of(chosen, found, frames)
-
-
-def _place_poses(found: parts.FoundCharacter) -> tuple[Fraction, Array] | None:
-    """Return frames per second and world matrices (frames, joints, 4, 4); None where no poses were read."""
-    poses = found.poses
-    if poses is None:
-        return None
-    local, outer = poses.local, poses.outer
-    parts.check_size(outer)
-    fps = frame_rate_of(poses.per_second)
-    if poses.seconds is not None:
-        fps, times = _choose_times(poses.seconds, poses.per_second, len(found.names))
-        local = _interpolate(poses.seconds, local, times)
-        if len(outer) > 1:
-            split = [parts.split_scale(matrix) for matrix in outer]
-            turns = rotations.from_matrix(torch.from_numpy(np.array([turn for turn, _ in split]))).numpy()
-            scales = np.repeat([[scale] for _, scale in split], 3, axis=1)
-            moved = np.concatenate([outer[:, :3, 3], turns, scales], axis=1)[:, None]
-            outer = compose_transforms(_interpolate(poses.seconds, moved, times))[:, 0]
-    for above in np.moveaxis(compose_transforms(poses.above), 1, 0):
-        outer = outer @ above
-    return fps, parts.chain_matrices(found.parents, compose_transforms(local), outer)
-
-
-def _choose_times(seconds: Array, per_second: float, joints: int) -> tuple[Fraction, Array]:
-    """Return frames per second and the frames' times: the time codes, where all samples lie on them. Refusal where
-    there would be too many."""
-    parts.check_poses(int(min(seconds[-1] - seconds[0], 1e15)), joints)
-    codes = seconds * per_second
-    if per_second <= _FASTEST_CODES and np.abs(codes - np.rint(codes)).max() < 1e-4:
-        count = int(min(np.rint(codes[-1]) - np.rint(codes[0]) + 1, 1e15))
-        parts.check_poses(count, joints)
-        return frame_rate_of(per_second), (round(codes[0]) + np.arange(count)) / per_second
-    fps, times = sample_times(seconds)
-    parts.check_poses(len(times), joints)
-    return fps, times
-
-
-def _interpolate(keys: Array, values: Array, times: Array) -> Array:
-    """Return transforms (times, joints, 10) of those at keys (keys, joints, 10): linear, rotations along their arcs."""
-    if len(keys) == len(times) and np.allclose(keys, times, atol=1e-9):
-        return values
-    after = np.searchsorted(keys, times, side="right").clip(1, len(keys) - 1) if len(keys) > 1 else np.zeros(1, int)
-    before = np.maximum(after - 1, 0)
-    gap = keys[after] - keys[before]
-    share = np.where(gap > 0, (times - keys[before]) / np.where(gap > 0, gap, 1.0), 0.0).clip(0.0, 1.0)
-    low, high = values[before], values[after]
-    done = low + (high - low) * share[:, None, None]
-    turns = [torch.from_numpy(np.ascontiguousarray(table[..., 3:7])).reshape(-1, 4) for table in (low, high)]
-    shares = torch.from_numpy(np.repeat(share, values.shape[1]))
-    units = [turn / turn.norm(dim=-1, keepdim=True).clamp_min(1e-12) for turn in turns]
-    done[..., 3:7] = rotations.slerp(units[0], units[1], shares).numpy().reshape(*low.shape[:2], 4)
-    return done
 
 
 def _build_part(part: parts.MeshPart, frames: RestFrames) -> CharacterMesh:
@@ -396,7 +286,7 @@ def build_skinned_body(motion: Motion) -> tuple[str, CharacterMesh]:
     order = np.argsort(-mesh.weights, axis=1, kind="stable")[:, :_MOST_CARRIERS]
     joints, weights = (np.take_along_axis(table, order, axis=1) for table in (mesh.joints, mesh.weights))
     weights /= weights.sum(axis=1, keepdims=True)
-    vertices, rest = mesh.vertices - mesh.rest[0], place_at_rest(motion.skeleton)
+    vertices, rest = mesh.vertices - mesh.rest[0], Motion.at_rest(motion.skeleton).joint_positions()[0].numpy()
     return "character", replace(mesh, vertices=vertices, joints=joints, weights=weights, rest=rest)
 
 

@@ -8,30 +8,22 @@ frame; those of a source can be kept in the frames that are still its own.
 from collections.abc import Sequence
 
 import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
 
 from mapctl import rotations
 
-W = 3
-"""Index of the scalar in xyzw."""
+_W = 3  # index of the scalar in xyzw
 _GIMBAL = 1e-7
 """Below this length of a pair of quaternion parts its angle is noise; holding it costs at most 2e-7 rad."""
 
 
 def to_quat_xyzw(radians: np.ndarray, axes: Sequence[int]) -> np.ndarray:
     """Convert angles (..., channels) about `axes` (0, 1, 2 for X, Y, Z), one each, to unit quaternions (..., 4)."""
-    quat = np.zeros((*radians.shape[:-1], 4))
-    quat[..., W] = 1.0
-    for channel, i in enumerate(axes):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        cos, sin = np.cos(radians[..., channel] / 2), np.sin(radians[..., channel] / 2)
-        before = quat.copy()
-        quat *= cos[..., None]
-        # Times sin e_i from the right: e_j e_i = -e_k, e_k e_i = e_j.
-        quat[..., i] += before[..., W] * sin
-        quat[..., W] -= before[..., i] * sin
-        quat[..., j] += before[..., k] * sin
-        quat[..., k] -= before[..., j] * sin
-    return quat
+    if not len(axes):
+        return np.tile((0.0, 0.0, 0.0, 1.0), (*radians.shape[:-1], 1))
+    turns = Rotation.from_euler("".join("XYZ"[axis] for axis in axes), radians.reshape(-1, len(axes)))
+    return turns.as_quat().reshape(*radians.shape[:-1], 4)
 
 
 def from_quat_xyzw(quat_xyzw: np.ndarray, axes: Sequence[int]) -> np.ndarray:
@@ -39,7 +31,7 @@ def from_quat_xyzw(quat_xyzw: np.ndarray, axes: Sequence[int]) -> np.ndarray:
 
     With fewer than three axes the angles are those of the nearest rotation the axes can make.
     """
-    quat = _sign_continuous(quat_xyzw)
+    quat = rotations.make_sign_continuous(torch.from_numpy(quat_xyzw)).numpy()
     if len(axes) == 3:
         return _three_angles(quat, axes)
     angles = _two_angles(quat, axes) if len(axes) == 2 else _one_angle(quat, axes)
@@ -80,14 +72,14 @@ def nearest_equivalent(path: np.ndarray, wanted: np.ndarray, axes: Sequence[int]
 
 
 def _one_angle(quat: np.ndarray, axes: Sequence[int]) -> np.ndarray:
-    parts = [2 * np.arctan2(quat[..., axis], quat[..., W]) for axis in axes]
+    parts = [2 * np.arctan2(quat[..., axis], quat[..., _W]) for axis in axes]
     return np.stack(parts, axis=-1) if parts else np.zeros((*quat.shape[:-1], 0))
 
 
 def _two_angles(quat: np.ndarray, axes: Sequence[int]) -> np.ndarray:
     """Solve two angles: (w, i) and (j, ek) are cos b/2 and sin b/2 times (cos a/2, sin a/2); e is the handedness."""
     (i, j), k = axes, 3 - sum(axes)
-    q_w, q_i, q_j, q_k = quat[..., W], quat[..., i], quat[..., j], _handedness(i, j) * quat[..., k]
+    q_w, q_i, q_j, q_k = quat[..., _W], quat[..., i], quat[..., j], _handedness(i, j) * quat[..., k]
     first = np.arctan2(2 * (q_w * q_i + q_j * q_k), q_w**2 + q_j**2 - q_i**2 - q_k**2)
     second = np.arctan2(2 * (q_w * q_j + q_i * q_k), q_w**2 + q_i**2 - q_j**2 - q_k**2)
     return np.stack([first, second], axis=-1)
@@ -103,7 +95,7 @@ def _three_angles(quat: np.ndarray, axes: Sequence[int]) -> np.ndarray:
     """
     i, j, last = axes
     proper, k, sign = i == last, 3 - i - j, _handedness(i, j)
-    q_w, q_i, q_j, q_k = quat[..., W], quat[..., i], quat[..., j], sign * quat[..., k]
+    q_w, q_i, q_j, q_k = quat[..., _W], quat[..., i], quat[..., j], sign * quat[..., k]
     real = (q_w, q_j) if proper else (q_w + q_j, q_w - q_j)
     imaginary = (q_i, q_k) if proper else (q_i + q_k, q_i - q_k)
     half_sum, sum_length = _hold_argument(imaginary[0], real[0])
@@ -145,11 +137,6 @@ def _closest_path(angles: np.ndarray, twin: np.ndarray) -> np.ndarray:
     path = np.where(on_twin[..., None], twin, angles)
     path[0] = rotations.wrap_angle(path[0])
     return np.unwrap(path, axis=0)
-
-
-def _sign_continuous(quat: np.ndarray) -> np.ndarray:
-    flips = np.cumsum((quat[1:] * quat[:-1]).sum(-1) < 0, axis=0) % 2
-    return np.concatenate([quat[:1], quat[1:] * (1 - 2 * flips)[..., None]])
 
 
 def _handedness(i: int, j: int) -> int:

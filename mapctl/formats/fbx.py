@@ -4,6 +4,7 @@
 """
 
 from collections.abc import Iterator
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import ufbx
 
 from mapctl.formats import parts, sandbox
 from mapctl.formats.sandbox import Refusal
+from mapctl.formats.units import frame_rate_of
 
 Array = np.ndarray
 NEWEST, OLDEST = 7799, 3000
@@ -65,7 +67,7 @@ def find_character(path: str, *, armature: str | None, animation: str | None, wa
             parts.find_name("", list(every), animation, "animation")
             raise Refusal(f"animation {animation!r} does not move {own.name!r}")
         if found.animation is not None:
-            found.poses = _sample(scene, found.animation, *takes[found.animation], own)
+            found.motion = _sample(scene, found.animation, *takes[found.animation], own)
     if wanted == "mesh":
         found.parts = _read_parts(scene, own, Path(path).resolve().parent)
     return found
@@ -280,8 +282,9 @@ def _moved_nodes(stack: ufbx.AnimStack) -> set[int]:
 
 def _sample(
     scene: ufbx.Scene, name: str, stack: ufbx.AnimStack, begin: float, end: float, armature: parts.Armature[ufbx.Node]
-) -> parts.Poses:
-    outer = line_of(armature.nodes[0])[:0:-1]
+) -> tuple[Fraction, Array]:
+    """Return frames per second, and world matrices (frames, joints, 4, 4)."""
+    above = line_of(armature.nodes[0])[:0:-1]
     rate = scene.settings.frames_per_second
     if ufbx.find_int(scene.settings.props, "TimeMode", 0) == _MODE_119_88:
         rate = 120 / 1.001
@@ -291,15 +294,14 @@ def _sample(
     if not (np.isfinite(begin) and np.isfinite(end)) or end < begin:
         raise Refusal(f"animation {name!r} lasts from {begin:g} to {end:g} s")
     count = np.floor((end - begin) * rate + _EARLY_SHARE) + 1
-    parts.check_poses(count, len(armature.nodes) + len(outer))
+    parts.check_poses(count, len(armature.nodes) + len(above))
     times = begin + np.arange(int(count)) / rate
     moved = _moved_nodes(stack)
+    outer = np.eye(4)
+    for node in above:
+        outer = outer @ _sample_node(stack.anim, node, times, moved)
     local = np.stack([_sample_node(stack.anim, node, times, moved) for node in armature.nodes], axis=1)
-    above = np.zeros((1, 0, 10))
-    if outer:
-        above = np.stack([_sample_node(stack.anim, node, times, moved) for node in outer], axis=1)
-    is_moved = bool({node.element_id for node in outer} & moved)
-    return parts.Poses(rate, None, local, np.eye(4)[None], above if is_moved else above[:1])
+    return frame_rate_of(rate), parts.chain_matrices(armature.parents, local, outer)
 
 
 def _find_range(stack: ufbx.AnimStack, own: set[int]) -> tuple[float, float]:
@@ -319,14 +321,14 @@ def _find_range(stack: ufbx.AnimStack, own: set[int]) -> tuple[float, float]:
 
 
 def _sample_node(anim: ufbx.Anim, node: ufbx.Node, times: Array, moved: set[int]) -> Array:
-    """Return translation, rotation xyzw and scale (times, 10)."""
+    """Return what takes the node's frame to its parent's, (times, 4, 4)."""
     if node.is_root:
         found = [node.local_transform]
     else:
         shown = times if node.element_id in moved else times[:1]
         found = [ufbx.evaluate_transform(anim, node, time) for time in shown.tolist()]
-    table = np.array([(*one.translation, *one.rotation, *one.scale) for one in found])
-    return table if len(table) == len(times) else np.tile(table, (len(times), 1))
+    table = parts.compose_transforms(np.array([(*one.translation, *one.rotation, *one.scale) for one in found]))
+    return np.broadcast_to(table, (len(times), 4, 4))
 
 
 def _read_parts(scene: ufbx.Scene, armature: parts.Armature[ufbx.Node], folder: Path) -> list[parts.MeshPart]:

@@ -16,7 +16,6 @@ from mapctl import rotations
 from mapctl.blender import WRITE_FBX
 from mapctl.errors import RequestError
 from mapctl.formats.atomic import atomic_path
-from mapctl.formats.bvh import check_finite
 from mapctl.formats.character import build_skinned_body, character_of
 from mapctl.formats.text import one_line
 from mapctl.motion import Motion
@@ -44,16 +43,13 @@ def save(motion: Motion, path: str | PathLike[str]) -> None:
     """Write a motion: on the character whose file its skeleton came from, else on a mannequin.
 
     Of the character's file Blender imports and exports joints, meshes, skins and materials; its animations are left
-    out. RequestError where the motion holds a NaN, the character's file has changed since it was read, or Blender
-    cannot write it.
+    out. RequestError where the character's file has changed since it was read, or Blender cannot write it.
     """
-    check_finite(motion, path)
     source = character_of(motion, ".fbx")
     turns = motion.joint_rotations()
     if source is None:
         character = _describe_body(motion)
     else:
-        source.check_unchanged()
         turns = rotations.multiply(turns, torch.from_numpy(source.frames.quat_xyzw))
         character = {"character": str(source.path), "armature": source.armature}
     with atomic_path(path) as scratch, tempfile.TemporaryDirectory() as folder:
@@ -79,10 +75,7 @@ def save(motion: Motion, path: str | PathLike[str]) -> None:
 def _describe_body(motion: Motion) -> dict[str, object]:
     """Return the arrays of a skeleton and its skinned body at rest, metres."""
     skeleton = motion.skeleton
-    rest = skeleton.offsets.numpy().copy()
-    rest[0] = 0.0
-    for joint, parent in enumerate(skeleton.parents[1:], start=1):
-        rest[joint] += rest[parent]
+    rest = Motion.at_rest(skeleton).joint_positions()[0].numpy()
     name, body = build_skinned_body(motion)
     vertices, _ = body.pose(rest, np.tile(np.eye(3), (len(rest), 1, 1)))
     return {

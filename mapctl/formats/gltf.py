@@ -28,11 +28,11 @@ import torch
 from mapctl import kinematics, rotations
 from mapctl.errors import RequestError
 from mapctl.formats import parts
-from mapctl.formats.atomic import write_pieces
-from mapctl.formats.bvh import check_finite
-from mapctl.formats.character import CharacterSource, build_skinned_body, character_of, compose_matrices, sample_times
+from mapctl.formats.atomic import write_bytes
+from mapctl.formats.character import CharacterSource, build_skinned_body, character_of
 from mapctl.formats.sandbox import Refusal
 from mapctl.formats.text import MAX_FILE_BYTES, check_ordinary, one_line, read_bytes, shorten, warn_once
+from mapctl.formats.units import sample_times
 from mapctl.motion import Motion
 from mapctl.rotations import make_sign_continuous
 from mapctl.skeleton import CANONICAL, Skeleton
@@ -390,10 +390,7 @@ def _node_matrix(node: Json) -> Array:
     """Return what takes a node's frame to its parent's, (4, 4)."""
     if node.get("matrix") is not None:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
-    position, turn, scale = _node_parts(node).values()
-    length = np.linalg.norm(turn)
-    turn = turn / length if length > 1e-9 else np.array(_AT_REST["rotation"])
-    return compose_matrices(position, turn, scale)
+    return parts.compose_matrices(*_node_parts(node).values())
 
 
 def read_bones(gltf: Gltf) -> dict[str, int]:
@@ -576,9 +573,7 @@ def _sample_tracks(gltf: Gltf, nodes: Sequence[int], tracks: Sequence[Track]) ->
             continue
         placed = {path: np.tile(values, (len(times), 1)) for path, values in _node_parts(own).items()}
         placed |= {track.path: track.sample(times) for track in tracks if track.node == node}
-        lengths = np.linalg.norm(placed["rotation"], axis=1, keepdims=True)
-        turns = np.where(lengths > 1e-9, placed["rotation"] / np.maximum(lengths, 1e-9), _AT_REST["rotation"])
-        matrices[:, number] = compose_matrices(placed["translation"], turns, placed["scale"])
+        matrices[:, number] = parts.compose_matrices(*placed.values())
     return fps, matrices
 
 
@@ -680,10 +675,9 @@ def save(motion: Motion, path: str | PathLike[str]) -> None:
     """Write a motion as .glb or .vrm: on the character whose file its skeleton came from, else on a mannequin; as .vrma
     without either.
 
-    RequestError where the motion holds a NaN, for a .vrm of a motion that is of no VRM character, and for a .vrma of
-    one whose bones are not known.
+    RequestError for a .vrm of a motion that is of no VRM character, for a .vrma of one whose bones are not known, and
+    where the character's file has changed since it was read.
     """
-    check_finite(motion, path)
     ending = PurePath(path).suffix.lower()
     if ending == ".vrma":
         return _save_bones(motion, path)
@@ -691,7 +685,7 @@ def save(motion: Motion, path: str | PathLike[str]) -> None:
     if ending == ".vrm" and (source is None or not source.humanoid):
         raise RequestError(f"cannot write {path}: a .vrm needs a character, as by --rig hero.vrm")
     if source is None:
-        write_pieces(path, _compose(motion))
+        write_bytes(path, _compose(motion))
     else:
         _save_character(motion, path, source)
 
@@ -701,16 +695,14 @@ def _save_character(motion: Motion, path: str | PathLike[str], source: Character
 
     Meshes, materials, skins, morphs, extensions and further nodes stay byte for byte, and so do the file's animations,
     but the one that the motion was read from is replaced. What a .gltf kept in other files is put into the one.
-    RequestError where the character's file has changed since it was read.
     """
-    source.check_unchanged()
     with parts.names_file(source.path), _refuse_malformed():
         gltf, tree, binary = _gather(source.path)
-    appended = _Arrays(tree, sum(len(piece) for piece in binary))
+    arrays = _Arrays(tree, binary)
     nodes = [int(node) for node in source.nodes]
     if source.has_new_root:
         nodes[0] = _add_node_above(tree, nodes[1], source.frames.names[0])
-    animation = _build_character_animation(motion, source, nodes, tree, appended, Path(path).stem)
+    animation = _build_character_animation(motion, source, nodes, arrays, Path(path).stem)
     named = zip(tree.get("animations", []), _name_animations(gltf), strict=True)
     tree["animations"] = [animation, *(other for other, name in named if name != source.animation)]
     if motion.licence:
@@ -718,20 +710,18 @@ def _save_character(motion: Motion, path: str | PathLike[str], source: Character
         extras = asset.get("extras")
         tree["asset"] = {**asset, "extras": {**(extras if isinstance(extras, dict) else {}), LICENCE: motion.licence}}
     first = tree["buffers"][0] if tree.get("buffers") else {}
-    tree["buffers"] = [{**first, "byteLength": appended.size}]
-    write_pieces(path, _compose_glb(tree, [*binary, *appended.pieces]))
+    tree["buffers"] = [{**first, "byteLength": len(binary)}]
+    write_bytes(path, _compose_glb(tree, binary))
 
 
-def _gather(path: Path) -> tuple[Gltf, Json, list[bytes]]:
-    """Read a file; also return a copy of the document with one buffer, and its pieces: other files are put into it."""
+def _gather(path: Path) -> tuple[Gltf, Json, bytearray]:
+    """Read a file; also return a copy of the document with one buffer, and that: other files are put into it."""
     gltf = read_file(path)
-    tree = copy.deepcopy(gltf.tree)
-    pieces: list[bytes] = []
-    starts = []
+    tree, binary, starts = copy.deepcopy(gltf.tree), bytearray(), list[int]()
 
     def append(data: bytes) -> int:
-        start = sum(map(len, pieces))
-        pieces.extend([data, bytes(-len(data) % 4)])
+        start = len(binary)
+        binary.extend(data + bytes(-len(data) % 4))
         return start
 
     for buffer, data in zip(tree.get("buffers", []), gltf.buffers, strict=True):
@@ -751,31 +741,30 @@ def _gather(path: Path) -> tuple[Gltf, Json, list[bytes]]:
             views = tree.setdefault("bufferViews", [])
             image["bufferView"] = len(views)
             views.append({"buffer": 0, "byteOffset": append(data), "byteLength": len(data)})
-    return gltf, tree, [piece for piece in pieces if len(piece)]
+    return gltf, tree, binary
 
 
-def _compose_glb(tree: Json, binary: list[bytes]) -> list[bytes]:
-    """Compose the pieces of a .glb file of a document and the pieces of its binary chunk, of a multiple of 4 bytes."""
+def _compose_glb(tree: Json, binary: bytearray) -> bytes:
+    """Compose a .glb file of a document and its binary chunk, of a multiple of 4 bytes."""
     text = json.dumps(tree, ensure_ascii=False, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
-    size = sum(len(piece) for piece in binary)
     chunks = [_CHUNK.pack(len(text), b"JSON"), text]
-    if size:
-        chunks += [_CHUNK.pack(size, b"BIN\0"), *binary]
-    return [_HEADER.pack(b"glTF", 2, _HEADER.size + sum(len(chunk) for chunk in chunks)), *chunks]
+    if binary:
+        chunks += [_CHUNK.pack(len(binary), b"BIN\0"), binary]
+    return b"".join([_HEADER.pack(b"glTF", 2, _HEADER.size + sum(map(len, chunks))), *chunks])
 
 
 class _Arrays:
     """Arrays that are added to a document and its buffer."""
 
-    def __init__(self, tree: Json, size: int):
-        self.tree, self.size, self.pieces = tree, size, list[bytes]()
+    def __init__(self, tree: Json, binary: bytearray):
+        self.tree, self.binary = tree, binary
 
     def add(self, values: Array, target: int | None = None) -> int:
         """Add numbers, (n,) or (n, width), floats with 32 bits, with least and greatest; return the accessor."""
         table = np.ascontiguousarray(values, np.float32 if values.dtype.kind == "f" else None).reshape(len(values), -1)
         views, accessors = self.tree.setdefault("bufferViews", []), self.tree.setdefault("accessors", [])
-        views.append({"buffer": 0, "byteOffset": self.size, "byteLength": table.nbytes})
+        views.append({"buffer": 0, "byteOffset": len(self.binary), "byteLength": table.nbytes})
         if target is not None:
             views[-1]["target"] = target
         accessors.append(
@@ -788,20 +777,19 @@ class _Arrays:
                 "max": table.max(0).tolist(),
             }
         )
-        self.pieces.append(table.tobytes())
-        self.size += table.nbytes
+        self.binary += table.tobytes()
         return len(accessors) - 1
 
 
 def _build_character_animation(
-    motion: Motion, source: CharacterSource, nodes: Sequence[int], tree: Json, appended: _Arrays, name: str
+    motion: Motion, source: CharacterSource, nodes: Sequence[int], arrays: _Arrays, name: str
 ) -> Json:
     moved, turned = source.frames.to_locals(motion)
     times = np.arange(motion.num_frames) / float(motion.fps)
-    still, every = appended.add(times[:1]), appended.add(times)
+    still, every = arrays.add(times[:1]), arrays.add(times)
     animation: Json = {"name": name, "channels": [], "samplers": []}
     for joint, node in enumerate(nodes):
-        own = tree["nodes"][node]
+        own = arrays.tree["nodes"][node]
         _use_parts(own)
         if source.frames.scales[joint] < 0:
             turned[:, joint] = _beside_own_scale(own, turned[:, joint])
@@ -810,7 +798,7 @@ def _build_character_animation(
             usual = np.array(own.get(path, _AT_REST[path]))
             if constant and path == "translation" and np.allclose(values[0], usual, rtol=1e-6, atol=1e-6):
                 continue
-            output = appended.add(values[:1] if constant else values)
+            output = arrays.add(values[:1] if constant else values)
             _add_channel(animation, node, path, still if constant else every, output)
     return animation
 
@@ -829,7 +817,7 @@ def _beside_own_scale(node: Json, turned: Array) -> Array:
     """Return rotations (frames, 4) that go with the scale of a node that mirrors, along whichever axes, of those that
     go with one of -1 along all."""
     own = torch.tensor(node.get("rotation", (0.0, 0.0, 0.0, 1.0)), dtype=torch.float64)
-    matrix = compose_matrices(np.zeros(3), own.numpy(), np.array(node["scale"]))
+    matrix = parts.compose_matrices(np.zeros(3), own.numpy(), np.array(node["scale"]))
     rest = rotations.from_matrix(torch.from_numpy(parts.split_scale(matrix, may_mirror=True)[0]))
     change = rotations.multiply(rotations.inverse(rest), own)
     return rotations.multiply(torch.from_numpy(turned), change).numpy()
@@ -851,10 +839,8 @@ def _add_channel(animation: Json, node: int, path: str, times: int, values: int)
     animation["samplers"].append({"input": times, "output": values, "interpolation": "LINEAR"})
 
 
-def _compose(
-    motion: Motion, bones: Mapping[str, int] | None = None, root_at_rest: list[float] | None = None
-) -> list[bytes]:
-    """Compose the pieces of a file on a mannequin.
+def _compose(motion: Motion, bones: Mapping[str, int] | None = None, root_at_rest: list[float] | None = None) -> bytes:
+    """Compose a file on a mannequin.
 
     With `bones`, the joint by VRM's name of a bone, it is a VRM animation, without the mannequin; `root_at_rest` is
     then the position of the root in the T-pose, metres.
@@ -866,7 +852,7 @@ def _compose(
         "scenes": [{"nodes": [0]}],
         "nodes": _build_nodes(motion),
     }
-    arrays = _Arrays(tree, 0)
+    arrays = _Arrays(tree, bytearray())
     if bones is None:
         _add_body(motion, tree, arrays)
     else:
@@ -875,8 +861,8 @@ def _compose(
         humanoid = {"humanBones": {bone: {"node": node} for bone, node in bones.items()}}
         tree["extensions"] = {ANIMATION: {"specVersion": "1.0", "humanoid": humanoid}}
     tree["animations"] = [_build_animation(motion, arrays)]
-    tree["buffers"] = [{"byteLength": arrays.size}]
-    return _compose_glb(tree, arrays.pieces)
+    tree["buffers"] = [{"byteLength": len(arrays.binary)}]
+    return _compose_glb(tree, arrays.binary)
 
 
 def _build_nodes(motion: Motion) -> list[Json]:
@@ -942,7 +928,7 @@ def _save_bones(motion: Motion, path: str | PathLike[str]) -> None:
     body, hips = _select_bones(motion, bones, path)
     of_joint = {joint: bone for bone, joint in bones.items()}
     order = {of_joint[motion.skeleton.index(name)]: node for node, name in enumerate(body.skeleton.names)}
-    write_pieces(path, _compose(body, order, hips))
+    write_bytes(path, _compose(body, order, hips))
 
 
 def _find_bones(motion: Motion) -> dict[str, int]:
@@ -960,10 +946,7 @@ def _find_bones(motion: Motion) -> dict[str, int]:
 
 def _select_bones(motion: Motion, bones: Mapping[str, int], path: str | PathLike[str]) -> tuple[Motion, list[float]]:
     """Return the motion of the bones alone, the hips first, and where these are at rest in the world."""
-    whole = motion.skeleton
-    rest = whole.offsets.clone()
-    for joint, parent in enumerate(whole.parents[1:], start=1):
-        rest[joint] += rest[parent]
+    whole, rest = motion.skeleton, Motion.at_rest(motion.skeleton).joint_positions()[0]
     hips = bones["hips"]
     joints = [hips, *sorted(set(bones.values()) - {hips})]
     parents = [-1, *(_nearest_above(whole, joint, joints) for joint in joints[1:])]

@@ -28,7 +28,7 @@ from torch import Tensor
 from mapctl.errors import FileFormatError, MapctlError, RequestError
 from mapctl.formats import missing
 from mapctl.formats.atomic import write_bytes
-from mapctl.formats.bvh import as_array, check_finite
+from mapctl.formats.bvh import as_array
 from mapctl.formats.missing import MissingValues
 from mapctl.formats.text import LARGEST_VALUE, MAX_FILE_BYTES, NUMBER, one_line, read_bytes
 from mapctl.formats.units import FASTEST, SLOWEST
@@ -87,8 +87,7 @@ def read(
 
 
 def save(motion: Motion, path: str | PathLike[str]) -> None:
-    """Write the motion under the keys above. Same motion, same bytes. RequestError where it holds a NaN."""
-    check_finite(motion, path)
+    """Write the motion under the keys above. Same motion, same bytes."""
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **to_arrays(motion))
     write_bytes(path, buffer.getvalue())

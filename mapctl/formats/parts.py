@@ -136,22 +136,6 @@ class MeshPart:
     """(n, k) how much; each vertex's add up to 1."""
 
 
-@dataclass(frozen=True, eq=False)
-class Poses:
-    """Poses of a character at its keys; transforms (..., 10) are translation, rotation xyzw and scale."""
-
-    per_second: float
-    """Frames, or time codes, per second."""
-    seconds: Array | None
-    """(keys,) times; None where there is a key in every frame."""
-    local: Array
-    """(keys, joints, 10) of each joint in its parent's frame."""
-    outer: Array
-    """(keys or 1, 4, 4) what takes the frame that the outermost of `above` is in to the world."""
-    above: Array = field(default_factory=lambda: np.zeros((1, 0, 10)))
-    """(keys or 1, nodes, 10) of what is above the root, the outermost first."""
-
-
 @dataclass(eq=False, kw_only=True)
 class FoundCharacter:
     """A character's joints in a file, and what was read of them. The world is in metres, with Y up."""
@@ -182,8 +166,6 @@ class FoundCharacter:
     animations: dict[str, float] = field(default_factory=dict)
     """Seconds by name of the animations that fit the character; empty unless its motion was read."""
     animation: str | None = None
-    poses: Poses | None = None
-    """Its poses at its keys, or else `motion`."""
     motion: tuple[Fraction, Array] | None = None
     """Frames per second, and world matrices (frames, joints, 4, 4)."""
     parts: list[MeshPart] = field(default_factory=list)
@@ -207,8 +189,31 @@ def check_poses(frames: float, joints: int) -> None:
         raise Refusal(f"{frames:.0f} frames of {joints} joints, allowed are {MAX_POSES} in all")
 
 
+def compose_matrices(translations: Array, quat_xyzw: Array, scales: Array) -> Array:
+    """Return matrices (..., 4, 4) that scale by (..., 3), then turn by (..., 4), then move by (..., 3). A quaternion of
+    length zero does not turn."""
+    unit = quat_xyzw / np.maximum(np.linalg.norm(quat_xyzw, axis=-1, keepdims=True), 1e-9)
+    across = -np.cross(unit[..., None, :3], np.eye(3))  # the matrix of a product with the vector part, by rows
+    turns = np.eye(3) + 2 * (unit[..., 3:, None] * across + across @ across)
+    matrices = np.zeros((*turns.shape[:-2], 4, 4))
+    matrices[..., :3, :3] = turns * scales[..., None, :]
+    matrices[..., :3, 3] = translations
+    matrices[..., 3, 3] = 1.0
+    return matrices
+
+
+def compose_transforms(transforms: Array) -> Array:
+    """Return matrices (..., 4, 4) of translation, rotation xyzw and scale (..., 10). Refusal where they are not finite,
+    or larger than 1000 km."""
+    if not np.isfinite(transforms).all() or np.abs(transforms).max(initial=0.0) > _FARTHEST:
+        raise Refusal("its animation holds numbers that are not finite, or larger than 1000 km")
+    if np.linalg.norm(transforms[..., 3:7], axis=-1).min(initial=1.0) < 1e-6:
+        raise Refusal("its animation holds a rotation of length zero")
+    return compose_matrices(transforms[..., :3], transforms[..., 3:7], transforms[..., 7:])
+
+
 def chain_matrices(parents: Sequence[int], local: Array, outer: Array) -> Array:
-    """Return world matrices (..., joints, 4, 4) of local ones; `outer` (4, 4) takes the root's frame to the world.
+    """Return world matrices (..., joints, 4, 4) of local ones; `outer` (..., 4, 4) takes the root's frame to the world.
     Refusal as of `check_size`."""
     worlds = np.empty_like(local)
     with np.errstate(all="ignore"):

@@ -115,7 +115,7 @@ class SmplLayout:
 def build_skeleton(joints: int) -> Skeleton:
     """Build the tree of SMPL (24 joints), SMPL-H (52) or SMPL-X (55) with the bones of the canonical body, in its
     T-pose."""
-    rest = make_rest(CANONICAL).joint_positions()[0]
+    rest = Motion.at_rest(CANONICAL).joint_positions()[0]
     at = {name: rest[CANONICAL.index(like)] for name, (_, like) in _BODY.items() if like is not None}
     at["Spine2"] = (at["Spine1"] + at["Spine3"]) / 2
     parents = {name: parent for name, (parent, _) in _BODY.items()}
@@ -134,12 +134,6 @@ def build_skeleton(joints: int) -> Skeleton:
     names = tuple(parents)
     offsets = torch.stack([at[name] - at[parents[name]] if parents[name] else 0 * at[name] for name in names])
     return Skeleton(names, tuple(names.index(parents[name]) if parents[name] else -1 for name in names), offsets)
-
-
-def make_rest(skeleton: Skeleton) -> Motion:
-    """Make one frame in the T-pose."""
-    still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(1, skeleton.num_joints, 4)
-    return Motion(skeleton, Fraction(30), torch.zeros(1, 3, dtype=torch.float64), still)
 
 
 def order_joints(motion: Motion) -> Motion | None:

@@ -10,8 +10,9 @@ without torch.
 import errno
 import os
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,7 +23,8 @@ from scipy.spatial.transform import Rotation
 
 from mapctl.formats import parts, sandbox
 from mapctl.formats.sandbox import Refusal
-from mapctl.formats.text import MAX_FILE_BYTES, MAX_POSES
+from mapctl.formats.text import MAX_FILE_BYTES
+from mapctl.formats.units import frame_rate_of, sample_times
 
 if TYPE_CHECKING:  # the sandbox has no torch
     from mapctl.formats.character import CharacterSource
@@ -39,7 +41,8 @@ _REASON = re.compile(r"in file \S+ : '(.+?)'?\s*$", re.MULTILINE)
 _MAX_LAYERS = 1000
 _MAX_PICTURE_BYTES = 2**28
 _TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-_AT_REST = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0)
+_FASTEST_CODES = 240
+"""Time codes per second up to which each is a frame; more are parts of frames."""
 _FIRST = Usd.TimeCode.EarliestTime()
 _MARGIN = 0.3
 """Metres around the joints within which the body is."""
@@ -78,7 +81,7 @@ def find_character(path: str, *, armature: str | None, animation: str | None, wa
             if animation is not None or bound:
                 chosen = parts.find_name("", names, animation, "animation")
                 found.animation = names[chosen]
-                found.poses = _sample(stage, skeleton, moving[chosen], names[chosen])
+                found.motion = _sample(stage, skeleton, moving[chosen], names[chosen])
         if wanted == "mesh":
             found.parts = _read_parts(stage, skeleton, Path(path).resolve().parent)
     except (Tf.ErrorException, UnicodeDecodeError) as error:
@@ -118,9 +121,6 @@ def _add_root(found: parts.FoundCharacter, path: str) -> parts.FoundCharacter:
     found.parents = (-1, *(parent + 1 for parent in found.parents))
     found.worlds = np.concatenate([found.outer[None], found.worlds])
     found.parts = [replace(part, joints=part.joints + 1) for part in found.parts]
-    if found.poses is not None:
-        above = np.tile(_AT_REST, (len(found.poses.local), 1, 1))
-        found.poses = replace(found.poses, local=np.concatenate([above, found.poses.local], axis=1))
     return found
 
 
@@ -325,31 +325,47 @@ def _attributes_of(prim: Usd.Prim) -> list[Usd.Attribute]:
     return [animation.GetTranslationsAttr(), animation.GetRotationsAttr(), animation.GetScalesAttr()]
 
 
-def _sample(stage: Usd.Stage, skeleton: SkeletonPrim, prim: Usd.Prim, name: str) -> parts.Poses:
-    animation, attributes, what = UsdSkel.Animation(prim), _attributes_of(prim), f"animation {name!r}"
-    codes = {code for attribute in attributes for code in attribute.GetTimeSamples()}
-    placed = animated_placement(skeleton.prim)
+def _sample(stage: Usd.Stage, skeleton: SkeletonPrim, prim: Usd.Prim, name: str) -> tuple[Fraction, Array]:
+    """Return frames per second, and world matrices (frames, joints, 4, 4); of several roots with the joint above."""
+    attributes, placed, what = _attributes_of(prim), animated_placement(skeleton.prim), f"animation {name!r}"
+    codes = np.unique([*placed, *(code for attribute in attributes for code in attribute.GetTimeSamples())] or [0.0])
     per_second = stage.GetTimeCodesPerSecond()
     if not (np.isfinite(per_second) and 1e-3 <= per_second <= 1e6):
         raise Refusal(f"timeCodesPerSecond is {per_second:g}")
-    codes |= set(placed)
-    if codes and not np.isfinite(sum(codes)):
+    if not np.isfinite(codes).all():
         raise Refusal(f"{what} has times that are not finite")
-    parts.check_poses(len(codes), len(skeleton.joints))
-    if placed:
-        span = range(int(np.ceil(min(codes))), int(min(np.floor(max(codes)), min(codes) + MAX_POSES)) + 1)
-        parts.check_poses(len(span), len(skeleton.joints))
-        codes |= {float(code) for code in span}
-    times = np.array(sorted(codes) or [0.0])
-    local = _sample_joints(skeleton, animation, attributes, times, what)
-    outer = [world_of(skeleton.prim, Usd.TimeCode(time)) for time in (times.tolist() if placed else times[:1].tolist())]
-    return parts.Poses(per_second, times / per_second, local, np.array(outer))
+    fps, times = _choose_times(codes, per_second, len(skeleton.joints))
+    local = parts.compose_transforms(_sample_joints(skeleton, UsdSkel.Animation(prim), attributes, times, what))
+    outer = np.array(
+        [world_of(skeleton.prim, Usd.TimeCode(time)) for time in (times if placed else times[:1]).tolist()]
+    )
+    parts.check_size(outer)
+    for matrix in outer:
+        parts.split_scale(matrix)
+    worlds = parts.chain_matrices(skeleton.parents, local, outer)
+    if skeleton.parents.count(-1) > 1:
+        worlds = np.concatenate([np.broadcast_to(outer, (len(times), 4, 4))[:, None], worlds], axis=1)
+    return fps, worlds
+
+
+def _choose_times(codes: Array, per_second: float, joints: int) -> tuple[Fraction, Array]:
+    """Return frames per second and the frames' time codes: whole ones, where all samples are at such. Refusal where
+    there would be too many."""
+    span = codes[-1] - codes[0]
+    parts.check_poses(int(min(span / per_second, 1e15)), joints)
+    if per_second <= _FASTEST_CODES and np.abs(codes - np.rint(codes)).max() < 1e-4:
+        count = int(min(np.rint(span), 1e15)) + 1
+        parts.check_poses(count, joints)
+        return frame_rate_of(per_second), round(codes[0]) + np.arange(count, dtype=float)
+    fps, seconds = sample_times(codes / per_second)
+    parts.check_poses(len(seconds), joints)
+    return fps, seconds * per_second
 
 
 def _sample_joints(
     skeleton: SkeletonPrim, animation: UsdSkel.Animation, attributes: list[Usd.Attribute], times: Array, what: str
 ) -> Array:
-    """Return the skeleton's joints (keys, joints, 10); those that the animation leaves out are at rest."""
+    """Return the skeleton's joints (times, joints, 10); those that the animation leaves out are at rest."""
     moved = [str(joint) for joint in read_value(animation.GetJointsAttr()) or ()]
     index_of = {joint: number for number, joint in enumerate(skeleton.joints)}
     here = [number for number, joint in enumerate(moved) if joint in index_of]
@@ -567,13 +583,11 @@ def save(motion: "Motion", path: str | PathLike[str]) -> None:
     Of the character's file meshes, materials, skins, blend shapes and further prims stay as they are, and so do other
     animations; the one that the motion was read from is replaced. Layers that the file refers to stay files of their
     own where the new one lies in a folder that they are in; elsewhere, and of a .usdz, all becomes one layer.
-    RequestError where the motion holds a NaN or the character's file has changed since it was read.
+    RequestError where the character's file has changed since it was read.
     """
     from mapctl.formats.atomic import atomic_path
-    from mapctl.formats.bvh import check_finite
     from mapctl.formats.character import character_of
 
-    check_finite(motion, path)
     target = Path(path)
     source = character_of(motion, target.suffix)
     if source is None:
@@ -581,7 +595,6 @@ def save(motion: "Motion", path: str | PathLike[str]) -> None:
         with atomic_path(path) as scratch:
             _export(stage, scratch)
         return
-    source.check_unchanged()
     moved, turned, scales = _find_locals(motion, source)
     new = NewMotion(
         skeleton=str(source.nodes[-1]).partition(".")[0],
@@ -699,16 +712,30 @@ def _add_motion(stage: Usd.Stage, motion: NewMotion) -> None:
         animation = UsdSkel.Animation.Define(stage, skeleton.prim.GetPath().AppendChild(name))
     else:
         animation = UsdSkel.Animation(_as_own(stage, replaced))
-    animation.CreateJointsAttr(skeleton.joints)
+    _write_animation(animation, skeleton.prim, skeleton.joints, moved, turned, motion.scales, codes)
+    _set_extent(skeleton.prim, motion.positions)
+
+
+def _write_animation(
+    animation: UsdSkel.Animation,
+    skeleton: Usd.Prim,
+    joints: list[str],
+    moved: Array,
+    turned: Array,
+    scales: Array,
+    codes: Array,
+) -> None:
+    """Write translations (frames, joints, 3), rotations (frames, joints, 4) and scales (joints, 3) at time codes
+    (frames,), and bind the skeleton to the animation."""
+    animation.CreateJointsAttr(joints)
     attributes = animation.CreateTranslationsAttr(), animation.CreateRotationsAttr(), animation.CreateScalesAttr()
     for attribute in attributes:
         attribute.Clear()
-    attributes[2].Set(Vt.Vec3hArray.FromNumpy(np.ascontiguousarray(motion.scales, np.float16)))
-    _write_samples(attributes[1], Vt.QuatfArray, turned, codes.tolist())
-    _write_samples(attributes[0], Vt.Vec3fArray, moved, codes.tolist())
-    binding = UsdSkel.BindingAPI.Apply(skeleton.prim)
-    binding.CreateAnimationSourceRel().SetTargets([animation.GetPath()])
-    _set_extent(skeleton.prim, motion.positions)
+    attributes[2].Set(Vt.Vec3hArray.FromNumpy(np.ascontiguousarray(scales, np.float16)))
+    for attribute, kind, values in ((attributes[1], Vt.QuatfArray, turned), (attributes[0], Vt.Vec3fArray, moved)):
+        for value, code in zip(np.ascontiguousarray(values, np.float32), codes.tolist(), strict=True):
+            attribute.Set(kind.FromNumpy(value), code)  # USD's quaternions take xyzw, as ours are
+    UsdSkel.BindingAPI.Apply(skeleton).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
 
 
 def _as_own(stage: Usd.Stage, prim: Usd.Prim) -> Usd.Prim:
@@ -770,11 +797,6 @@ def _plain_name(name: str, taken: Collection[str]) -> str:
     return next(w for w in (plain, *(f"{plain}_{k}" for k in range(2, len(taken) + 3))) if w not in taken)
 
 
-def _write_samples(attribute: Usd.Attribute, kind: type, values: Array, codes: Sequence[float]) -> None:
-    for value, code in zip(np.ascontiguousarray(values, np.float32), codes, strict=True):
-        attribute.Set(kind.FromNumpy(value), code)  # USD's quaternions take xyzw, as ours are
-
-
 def _set_extent(prim: Usd.Prim, positions: Array) -> None:
     """Set the extent of the SkelRoot that a skeleton is in, if it has one; viewers draw nothing beyond it."""
     while prim and not prim.IsA(UsdSkel.Root):
@@ -799,7 +821,7 @@ def _build_stage(motion: "Motion") -> Usd.Stage:
     stage, rate, joints = Usd.Stage.CreateInMemory(), float(motion.fps), joint_paths(motion.skeleton)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    codes = _set_times(stage, None, motion.num_frames, rate).tolist()
+    codes = _set_times(stage, None, motion.num_frames, rate)
     top = UsdSkel.Root.Define(stage, _ROOT)
     stage.SetDefaultPrim(top.GetPrim())
     name, body = build_skinned_body(motion)
@@ -819,22 +841,13 @@ def _build_stage(motion: "Motion") -> Usd.Stage:
             matrices[:, :3, :3] = np.swapaxes(frames, 1, 2)
         create(Vt.Matrix4dArray.FromNumpy(matrices))
 
-    animation = UsdSkel.Animation.Define(stage, f"{_ROOT}/motion")
-    animation.CreateJointsAttr(joints)
-    animation.CreateScalesAttr(Vt.Vec3hArray.FromNumpy(np.ones((len(joints), 3), np.float16)))
-    translations = all_translations(motion).astype(np.float32)
-    if not motion.moving_offsets and (translations[:, 0] == translations[0, 0]).all():
-        animation.CreateTranslationsAttr().Set(Vt.Vec3fArray.FromNumpy(translations[0]))
-    else:
-        _write_samples(animation.CreateTranslationsAttr(), Vt.Vec3fArray, translations, codes)
-    turns = as_array(make_sign_continuous(motion.local_quat_xyzw))
-    _write_samples(animation.CreateRotationsAttr(), Vt.QuatfArray, turns, codes)
-    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
+    animation, turned = UsdSkel.Animation.Define(stage, f"{_ROOT}/motion"), make_sign_continuous(motion.local_quat_xyzw)
+    moved, scales = all_translations(motion), np.ones((len(joints), 3))
+    _write_animation(animation, skeleton.GetPrim(), joints, moved, as_array(turned), scales, codes)
 
     UsdSkel.BindingAPI.Apply(_define_mesh(stage, name, body)).CreateSkeletonRel().SetTargets([skeleton.GetPath()])
-    reach = motion.joint_positions().numpy().reshape(-1, 3)  # viewers frame the character by the extent
-    corners = reach.min(0) - _MARGIN, reach.max(0) + _MARGIN
-    top.CreateExtentAttr([Gf.Vec3f(*corner.tolist()) for corner in corners])
+    top.CreateExtentAttr([Gf.Vec3f(0.0)] * 2)
+    _set_extent(top.GetPrim(), motion.joint_positions().numpy())
     if motion.licence:
         stage.GetRootLayer().customLayerData = {"licence": motion.licence}
     return stage

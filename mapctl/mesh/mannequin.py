@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from fractions import Fraction
 from functools import cached_property
 
 import numpy as np
@@ -414,17 +413,8 @@ class Body:
         return np.array(pairs), radii, np.array([_SIDES[r.side][1] if r.side in _SIDES else self.colour for r in roles])
 
 
-def place_at_rest(skeleton: Skeleton) -> Array:
-    """Return the joints (joints, 3) in the rest pose, metres, with the root at the origin."""
-    rest = np.zeros((skeleton.num_joints, 3))
-    for joint, parent in enumerate(skeleton.parents[1:], start=1):
-        rest[joint] = skeleton.offsets[joint].numpy() + rest[parent]
-    return rest
-
-
 def at_rest(skeleton: Skeleton = CANONICAL) -> Motion:
     """Return one frame of a skeleton in its rest pose, the lowest joint as high as a toe joint of a flat foot."""
-    still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).repeat(1, skeleton.num_joints, 1)
-    motion = Motion(skeleton, Fraction(30), torch.zeros(1, 3, dtype=torch.float64), still)
+    motion = Motion.at_rest(skeleton)
     lowest = float(motion.joint_positions()[..., 1].min())
     return replace(motion, root_position=torch.tensor([[0.0, TOE_REST_HEIGHT - lowest, 0.0]], dtype=torch.float64))

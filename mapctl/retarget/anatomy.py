@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl import kinematics, rotations
+from mapctl import rotations
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, Skeleton, mirror_name
 
@@ -42,11 +42,8 @@ class RigPoses:
     @staticmethod
     def zero(skeleton: Skeleton, joint_of: JointOf = range(CANONICAL.num_joints)) -> "RigPoses":
         """Return the pose with all rotations zero; of canonical joints where none are named."""
-        still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(1, skeleton.num_joints, 4)
-        root = torch.zeros(1, 3, dtype=torch.float64)
-        return RigPoses(
-            *kinematics.forward_kinematics(skeleton.offsets, skeleton.parents, root, still), skeleton, tuple(joint_of)
-        )
+        rest = Motion.at_rest(skeleton)
+        return RigPoses(rest.joint_positions(), rest.joint_rotations(), skeleton, tuple(joint_of))
 
     @staticmethod
     def of(motion: Motion, joint_of: JointOf) -> "RigPoses":

@@ -77,16 +77,6 @@ def open_curves(armature: bpy.types.Object):
     return strip.channelbag(_find_slot(armature), ensure=True)
 
 
-def list_curves(armature: bpy.types.Object) -> list[bpy.types.FCurve]:
-    """List the curves by which the armature's action moves it."""
-    action = find_action(armature)
-    if not hasattr(action, "layers"):
-        return list(action.fcurves)
-    slot = _find_slot(armature)
-    bags = [strip.channelbag(slot) for layer in action.layers for strip in layer.strips]
-    return [curve for bag in bags if bag for curve in bag.fcurves]
-
-
 def _find_slot(armature: bpy.types.Object):
     slot = armature.animation_data.action_slot
     if slot is None:
@@ -99,7 +89,7 @@ def _find_slot(armature: bpy.types.Object):
 def list_keys(armature: bpy.types.Object) -> dict[int, bool]:
     """List the frames in which bones have keys, and whether one of them is not a generated key."""
     generated, frames = number_type(generated=True), {}
-    for curve in list_curves(armature):
+    for curve in open_curves(armature).fcurves:
         if not curve.data_path.startswith("pose.bones["):
             continue
         keys = curve.keyframe_points
