@@ -12,7 +12,7 @@ import torch
 from mapctl.curves.obstacles import Obstacle
 from mapctl.ground import Ground
 from mapctl.mesh import colours
-from mapctl.mesh.primitives import Array, Surface, merge_surfaces, unit, unit_sphere
+from mapctl.mesh.primitives import Array, Surface, merge_surfaces, unit
 
 TILE_HEIGHT, LINE_HEIGHT, TARGET_HEIGHT, TRAIL_HEIGHT, MARK_HEIGHT, SHADOW_HEIGHT = np.arange(6) * 0.002
 LIGHT = unit(np.array([-0.34, -1.0, -0.28]))
@@ -213,8 +213,10 @@ def build_ground(ground: Ground) -> Surface:
 
 def build_target(position: tuple[float, float, float]) -> Surface:
     """Build a small ball at a position (x, y, z), metres, that a hand or a foot is to reach."""
-    vertices, faces = unit_sphere()
-    return _make_plain(_TARGET_RADIUS * vertices + np.array(position), faces, colours.TARGET)
+    import trimesh  # of the extras that draw
+
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=_TARGET_RADIUS)
+    return _make_plain(np.array(ball.vertices) + position, np.array(ball.faces), colours.TARGET)
 
 
 def build_look_mark(position: tuple[float, float, float]) -> Surface:

@@ -3,7 +3,6 @@
 `find_character` and all below it run in `mapctl.formats.sandbox`, without torch.
 """
 
-from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -40,9 +39,12 @@ def find_character(path: str, *, armature: str | None, animation: str | None, wa
     The rest pose is the one in which skins are bound where bones are as long as the nodes', else the nodes'.
     """
     scene, fault = open_scene(path, with_mesh=wanted == "mesh")
-    listed, own = parts.choose_armature(path, find_armatures(scene), armature)
-    root, names = own.nodes[0], parts.make_unique([node.name or f"node_{node.typed_id}" for node in own.nodes])
-    worlds = np.stack([to_matrix(node.node_to_world) for node in own.nodes])
+    nodes = each(scene.nodes)
+    tree = parts.NodeTree({node.typed_id: [child.typed_id for child in each(node.children)] for node in nodes})
+    listed, own = parts.choose_armature(path, find_armatures(scene, nodes, tree), armature)
+    joints, above = ([nodes[k] for k in numbers] for numbers in (own.nodes, tree.line(own.nodes[0])[1:]))
+    names = parts.make_unique([node.name or f"node_{node.typed_id}" for node in joints])
+    worlds = np.stack([to_matrix(node.node_to_world) for node in joints])
     bound = _read_bind_poses(scene, own)
     parts.check_size(worlds, *(matrix for pose in bound for matrix in pose.values()))
     complete = parts.complete_bind_pose(own.parents, bound, worlds)
@@ -54,12 +56,12 @@ def find_character(path: str, *, armature: str | None, animation: str | None, wa
         parents=own.parents,
         metres_per_unit=scene.settings.original_unit_meters,
         worlds=worlds if complete is None else complete,
-        outer=np.eye(4) if root.is_root else to_matrix(above(root).node_to_world),
-        ends={joint: to_matrix(node.node_to_parent)[:, 3:] for joint, node in own.ends.items()},
+        outer=to_matrix(above[0].node_to_world) if above else np.eye(4),
+        ends={joint: to_matrix(nodes[end].node_to_parent)[:, 3:] for joint, end in own.ends.items()},
         fault=fault,
     )
     if wanted == "motion":
-        takes = _name_takes(scene, own)
+        takes = _name_takes(scene, {node.element_id for node in [*joints, *above]})
         found.animations = {name: end - begin for name, (_, begin, end) in takes.items()}
         found.animation = next(iter(takes), None) if animation is None else animation
         if animation is not None and animation not in takes:
@@ -67,9 +69,10 @@ def find_character(path: str, *, armature: str | None, animation: str | None, wa
             parts.find_name("", list(every), animation, "animation")
             raise Refusal(f"animation {animation!r} does not move {own.name!r}")
         if found.animation is not None:
-            found.motion = _sample(scene, found.animation, *takes[found.animation], own)
+            found.motion = _sample(scene, found.animation, *takes[found.animation], joints, above, own.parents)
     if wanted == "mesh":
-        found.parts = _read_parts(scene, own, Path(path).resolve().parent)
+        index_of = {node: joint for joint, node in enumerate(own.nodes)}
+        found.parts = _read_parts(scene, index_of, tree, joints, Path(path).resolve().parent)
     return found
 
 
@@ -130,31 +133,6 @@ def each(elements: Any) -> list[Any]:
     return found
 
 
-def walk(node: ufbx.Node) -> Iterator[ufbx.Node]:
-    """Go through a node and all below it, parents first, in the file's order."""
-    waiting = [node]
-    while waiting:
-        one = waiting.pop()
-        yield one
-        waiting += reversed(each(one.children))
-
-
-def above(node: ufbx.Node) -> ufbx.Node:
-    """Return the node above one that is not the scene's root."""
-    found = node.parent
-    assert found is not None
-    return found
-
-
-def line_of(node: ufbx.Node) -> list[ufbx.Node]:
-    """Return a node and all above it but the scene's root."""
-    found = []
-    while not node.is_root:
-        found.append(node)
-        node = above(node)
-    return found
-
-
 def to_matrix(columns: ufbx.Matrix) -> Array:
     """Return a (4, 4) matrix of ufbx's four columns."""
     matrix = np.eye(4)
@@ -162,17 +140,17 @@ def to_matrix(columns: ufbx.Matrix) -> Array:
     return matrix
 
 
-def find_armatures(scene: ufbx.Scene) -> list[parts.Armature[ufbx.Node]]:
+def find_armatures(scene: ufbx.Scene, nodes: list[ufbx.Node], tree: parts.NodeTree) -> list[parts.Armature]:
     """Find the armatures of a file, in its order. Refusal where it has none."""
-    bones = _find_bones(scene)
+    bones = _find_bones(scene, nodes, tree)
     if not bones:
         raise Refusal("has no limb nodes and no skin, so nothing in it marks nodes as a character's joints")
-    return [_build(scene, group, bones) for group in _group(scene, bones)]
+    return [_build(nodes, tree, tops, bones) for tops in _group(scene, tree, bones)]
 
 
-def _read_bind_poses(scene: ufbx.Scene, armature: parts.Armature[ufbx.Node]) -> list[dict[int, Array]]:
+def _read_bind_poses(scene: ufbx.Scene, armature: parts.Armature) -> list[dict[int, Array]]:
     """Return world matrices (4, 4) by joint of the bind poses of the file: by its skins, and by its bind poses."""
-    index_of = {node.typed_id: joint for joint, node in enumerate(armature.nodes)}
+    index_of = {node: joint for joint, node in enumerate(armature.nodes)}
     skins: dict[int, Array] = {}
     for cluster in each(scene.skin_clusters):
         if cluster.bone_node is not None and cluster.bone_node.typed_id in index_of:
@@ -185,23 +163,22 @@ def _read_bind_poses(scene: ufbx.Scene, armature: parts.Armature[ufbx.Node]) -> 
     return [bound for bound in ({**poses, **skins}, poses) if bound]
 
 
-def _find_bones(scene: ufbx.Scene) -> dict[int, ufbx.Node]:
-    """Return limb nodes and nodes of skins, with what lies between them, by number."""
-    found = {node.typed_id: node for node in each(scene.nodes) if node.bone is not None}
-    for cluster in each(scene.skin_clusters):
-        if cluster.bone_node is not None and not cluster.bone_node.is_root:
-            found[cluster.bone_node.typed_id] = cluster.bone_node
-    for node in list(found.values()):
-        line = line_of(node)
-        last = max((k for k, other in enumerate(line) if other.typed_id in found), default=0)
-        found.update({other.typed_id: other for other in line[:last]})
+def _find_bones(scene: ufbx.Scene, nodes: list[ufbx.Node], tree: parts.NodeTree) -> set[int]:
+    """Return limb nodes and nodes of skins, with what lies between them."""
+    found = {node.typed_id for node in nodes if node.bone is not None}
+    carriers = [cluster.bone_node for cluster in each(scene.skin_clusters)]
+    found |= {node.typed_id for node in carriers if node is not None and not node.is_root}
+    for node in list(found):
+        line = tree.line(node)
+        found.update(line[: max(k for k, other in enumerate(line) if other in found)])
     return found
 
 
-def _group(scene: ufbx.Scene, bones: dict[int, ufbx.Node]) -> list[list[ufbx.Node]]:
+def _group(scene: ufbx.Scene, tree: parts.NodeTree, bones: set[int]) -> list[list[int]]:
     """Return the topmost joints by armature: those that share a skin, or hang on one node and are no two bodies."""
-    tops = [node for node in walk(scene.root_node) if node.typed_id in bones and above(node).typed_id not in bones]
-    top_of = {below.typed_id: k for k, top in enumerate(tops) for below in walk(top)}
+    root = scene.root_node.typed_id
+    tops = [node for node in tree.walk(root) if node in bones and tree.parent[node] not in bones]
+    top_of = {below: k for k, top in enumerate(tops) for below in tree.walk(top)}
     group = list(range(len(tops)))
 
     def join(first: int, second: int) -> None:
@@ -213,45 +190,34 @@ def _group(scene: ufbx.Scene, bones: dict[int, ufbx.Node]) -> list[list[ufbx.Nod
         used = sorted({top_of[number] for number in members if number in top_of})
         for other in used[1:]:
             join(used[0], other)
-    sizes = [sum(below.typed_id in bones for below in walk(top)) for top in tops]
+    sizes = [sum(below in bones for below in tree.walk(top)) for top in tops]
     for first in range(len(tops)):
         for second in range(first + 1, len(tops)):
-            same = above(tops[first]).typed_id == above(tops[second]).typed_id and not above(tops[first]).is_root
+            same = tree.parent[tops[first]] == tree.parent[tops[second]] != root
             if same and min(sizes[first], sizes[second]) < _BODY_JOINTS:
                 join(first, second)
     return [[top for top, own in zip(tops, group, strict=True) if own == one] for one in dict.fromkeys(group)]
 
 
-def _build(scene: ufbx.Scene, tops: list[ufbx.Node], bones: dict[int, ufbx.Node]) -> parts.Armature[ufbx.Node]:
-    root = tops[0]
-    if len(tops) > 1:  # their deepest common node
-        root = scene.root_node
-        for nodes in zip(*(line_of(top)[::-1] for top in tops), strict=False):
-            if any(node is not nodes[0] for node in nodes):
-                break
-            root = nodes[0]
-    lines = {node.typed_id for top in tops for node in line_of(top)}
-    joints = [node for node in walk(root) if node.typed_id in bones or node.typed_id in lines or node is root]
-    ends = {above(node).typed_id: node for node in joints if node is not root and _is_end(node)}
-    joints = [node for node in joints if node is root or not _is_end(node)]
+def _build(nodes: list[ufbx.Node], tree: parts.NodeTree, tops: list[int], bones: set[int]) -> parts.Armature:
+    between = tree.connect(tops)
+    root, wanted = between[0], bones.union(between)
+
+    def is_end(node: int) -> bool:
+        """Return whether a node is the tip that exporters add to a last limb: NAME_end, alone below it."""
+        alone = node != root and not tree.children[node] and len(tree.children[tree.parent[node]]) == 1
+        return alone and nodes[node].name.lower().endswith("_end") and not nodes[tree.parent[node]].is_root
+
+    joints = [node for node in tree.walk(root) if node in wanted]
+    ends = {tree.parent[node]: node for node in joints if is_end(node)}
+    joints = [node for node in joints if node not in ends.values()]
     if len(joints) > parts.MAX_JOINTS:
         raise Refusal(f"has an armature of {len(joints)} joints, allowed are {parts.MAX_JOINTS}")
-    index_of = {node.typed_id: index for index, node in enumerate(joints)}
-    parents = tuple(-1 if node is root else index_of[above(node).typed_id] for node in joints)
-    holder = "" if root.is_root or above(root).is_root else above(root).name
-    return parts.Armature(
-        holder or root.name or "armature", joints, parents, {index_of[k]: node for k, node in ends.items()}
-    )
-
-
-def _is_end(node: ufbx.Node) -> bool:
-    """Return whether a node is the tip that exporters add to a last limb: NAME_end, alone below it."""
-    return (
-        node.name.lower().endswith("_end")
-        and len(node.children) == 0
-        and not above(node).is_root
-        and len(above(node).children) == 1
-    )
+    index_of = {node: index for index, node in enumerate(joints)}
+    parents = tuple(-1 if node == root else index_of[tree.parent[node]] for node in joints)
+    holder = nodes[tree.parent.get(root, root)]
+    name = ("" if holder.is_root else holder.name) or nodes[root].name or "armature"
+    return parts.Armature(name, joints, parents, {index_of[above]: end for above, end in ends.items()})
 
 
 def _list_takes(scene: ufbx.Scene) -> dict[str, ufbx.AnimStack]:
@@ -261,11 +227,8 @@ def _list_takes(scene: ufbx.Scene) -> dict[str, ufbx.AnimStack]:
     )
 
 
-def _name_takes(
-    scene: ufbx.Scene, armature: parts.Armature[ufbx.Node]
-) -> dict[str, tuple[ufbx.AnimStack, float, float]]:
-    """Return the animations that move the armature or what is above it, with their first and last second, by name."""
-    own = {node.element_id for node in [*armature.nodes, *line_of(armature.nodes[0])]}
+def _name_takes(scene: ufbx.Scene, own: set[int]) -> dict[str, tuple[ufbx.AnimStack, float, float]]:
+    """Return the animations that move some of these elements, with their first and last second, by name."""
     takes = _list_takes(scene).items()
     return {name: (stack, *_find_range(stack, own)) for name, stack in takes if _moved_nodes(stack) & own}
 
@@ -281,10 +244,16 @@ def _moved_nodes(stack: ufbx.AnimStack) -> set[int]:
 
 
 def _sample(
-    scene: ufbx.Scene, name: str, stack: ufbx.AnimStack, begin: float, end: float, armature: parts.Armature[ufbx.Node]
+    scene: ufbx.Scene,
+    name: str,
+    stack: ufbx.AnimStack,
+    begin: float,
+    end: float,
+    joints: list[ufbx.Node],
+    above: list[ufbx.Node],
+    parents: tuple[int, ...],
 ) -> tuple[Fraction, Array]:
-    """Return frames per second, and world matrices (frames, joints, 4, 4)."""
-    above = line_of(armature.nodes[0])[:0:-1]
+    """Return frames per second, and world matrices (frames, joints, 4, 4); `above` are the nodes above the root."""
     rate = scene.settings.frames_per_second
     if ufbx.find_int(scene.settings.props, "TimeMode", 0) == _MODE_119_88:
         rate = 120 / 1.001
@@ -294,14 +263,14 @@ def _sample(
     if not (np.isfinite(begin) and np.isfinite(end)) or end < begin:
         raise Refusal(f"animation {name!r} lasts from {begin:g} to {end:g} s")
     count = np.floor((end - begin) * rate + _EARLY_SHARE) + 1
-    parts.check_poses(count, len(armature.nodes) + len(above))
+    parts.check_poses(count, len(joints) + len(above))
     times = begin + np.arange(int(count)) / rate
     moved = _moved_nodes(stack)
     outer = np.eye(4)
-    for node in above:
+    for node in reversed(above):
         outer = outer @ _sample_node(stack.anim, node, times, moved)
-    local = np.stack([_sample_node(stack.anim, node, times, moved) for node in armature.nodes], axis=1)
-    return frame_rate_of(rate), parts.chain_matrices(armature.parents, local, outer)
+    local = np.stack([_sample_node(stack.anim, node, times, moved) for node in joints], axis=1)
+    return frame_rate_of(rate), parts.chain_matrices(parents, local, outer)
 
 
 def _find_range(stack: ufbx.AnimStack, own: set[int]) -> tuple[float, float]:
@@ -331,22 +300,23 @@ def _sample_node(anim: ufbx.Anim, node: ufbx.Node, times: Array, moved: set[int]
     return np.broadcast_to(table, (len(times), 4, 4))
 
 
-def _read_parts(scene: ufbx.Scene, armature: parts.Armature[ufbx.Node], folder: Path) -> list[parts.MeshPart]:
+def _read_parts(
+    scene: ufbx.Scene, index_of: dict[int, int], tree: parts.NodeTree, joints: list[ufbx.Node], folder: Path
+) -> list[parts.MeshPart]:
     """Read what the armature's skins carry, and what hangs on its joints rigidly; pictures lie in `folder` or below."""
-    index_of = {node.typed_id: joint for joint, node in enumerate(armature.nodes)}
     found = []
     for mesh in each(scene.meshes):
         if mesh.num_indices > parts.MAX_CORNERS:
             raise Refusal(f"mesh {mesh.name!r} has {mesh.num_indices} corners, allowed are {parts.MAX_CORNERS}")
         for node in each(mesh.instances):
-            carriers = _read_carriers(mesh, node, index_of, armature)
+            carriers = _read_carriers(mesh, node, index_of, tree, joints)
             if carriers is not None and mesh.num_triangles:
                 found.append(_read_part(mesh, node, carriers, folder))
     return found
 
 
 def _read_carriers(
-    mesh: ufbx.Mesh, node: ufbx.Node, index_of: dict[int, int], armature: parts.Armature[ufbx.Node]
+    mesh: ufbx.Mesh, node: ufbx.Node, index_of: dict[int, int], tree: parts.NodeTree, joints: list[ufbx.Node]
 ) -> tuple[Array, Array, Array, Array] | None:
     """Return joints (m,) and matrices (m, 4, 4) from the mesh to their frames, and by vertex indices among them (n, k)
     and their shares; None where the armature does not carry the mesh."""
@@ -356,15 +326,15 @@ def _read_carriers(
         own = [index_of.get(c.bone_node.typed_id) if c.bone_node is not None else None for c in each(skin.clusters)]
         if all(joint is None for joint in own):
             return None
-        to_root = np.linalg.pinv(to_matrix(armature.nodes[0].node_to_world)) @ to_matrix(node.geometry_to_world)
+        to_root = np.linalg.pinv(to_matrix(joints[0].node_to_world)) @ to_matrix(node.geometry_to_world)
         matrices = [to_root, *(to_matrix(cluster.geometry_to_bone) for cluster in each(skin.clusters))]
         rows, shares = _read_weights(skin, count)
         return np.array([0, *(joint or 0 for joint in own)]), np.stack(matrices), rows, shares
-    above = next((other for other in line_of(node) if other.typed_id in index_of), None)
-    if above is None:
+    joint = next((index_of[other] for other in tree.line(node.typed_id)[:-1] if other in index_of), None)
+    if joint is None:
         return None
-    matrix = np.linalg.pinv(to_matrix(above.node_to_world)) @ to_matrix(node.geometry_to_world)
-    return np.array([index_of[above.typed_id]]), matrix[None], np.zeros((count, 1), np.int64), np.ones((count, 1))
+    matrix = np.linalg.pinv(to_matrix(joints[joint].node_to_world)) @ to_matrix(node.geometry_to_world)
+    return np.array([joint]), matrix[None], np.zeros((count, 1), np.int64), np.ones((count, 1))
 
 
 def _read_weights(skin: ufbx.SkinDeformer, count: int) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ import base64
 import copy
 import json
 import struct
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
@@ -84,7 +84,7 @@ def read_character(path: Path, *, armature: str | None, animation: str | None, w
     gltf = read_file(path)
     listed, own = parts.choose_armature(path, find_armatures(gltf), armature)
     nodes = [gltf.get("nodes", node) for node in own.nodes]
-    outer = gltf.chain(gltf.line(own.nodes[0])[1:])
+    outer = gltf.chain(gltf.nodes.line(own.nodes[0])[1:])
     worlds = parts.chain_matrices(own.parents, np.stack([_node_matrix(node) for node in nodes]), outer)
     is_vrm = any(name in gltf.tree.get("extensions", {}) for name in ("VRM", *_EXTENSIONS))  # whatever its ending
     bound = None if is_vrm else _bind_worlds(gltf, own, worlds, outer)
@@ -116,7 +116,7 @@ def _name_bones(gltf: "Gltf", names: Mapping[int, str]) -> dict[str, str]:
     return {bone: name for bone, name in bones.items() if bone in CANONICAL.names}
 
 
-def _read_motion(gltf: "Gltf", armature: parts.Armature[int], wanted: str | None, found: parts.FoundCharacter) -> None:
+def _read_motion(gltf: "Gltf", armature: parts.Armature, wanted: str | None, found: parts.FoundCharacter) -> None:
     """Add the wanted animation, else the first that moves the armature, to what was found."""
     names = _name_animations(gltf)
     numbers = range(len(names)) if wanted is None else [parts.find_name("", names, wanted, "animation")]
@@ -153,46 +153,9 @@ class Gltf:
         return found[index]
 
     @cached_property
-    def parent(self) -> dict[int, int]:
-        """The node that each node is a child of."""
-        parent: dict[int, int] = {}
-        for number, node in enumerate(self.all("nodes")):
-            for child in node.get("children", ()):
-                self.get("nodes", child)
-                if child in parent:
-                    raise Refusal(f"nodes[{child}] has two parents")
-                parent[child] = number
-        return parent
-
-    def line(self, node: int) -> list[int]:
-        """Return a node and all above it, up to the scene."""
-        found = [node]
-        while found[-1] in self.parent:
-            found.append(self.parent[found[-1]])
-            if len(found) > parts.MAX_JOINTS:
-                raise Refusal(f"nodes[{node}] is below itself, or below more than {parts.MAX_JOINTS} others")
-        return found
-
-    def connect(self, nodes: Iterable[int]) -> list[int]:
-        """Return these nodes, what lies between them, and their common root, parents first."""
-        lines = [self.line(node)[::-1] for node in set(nodes)]
-        depth = -1
-        for level in zip(*lines, strict=False):
-            if len(set(level)) > 1:
-                break
-            depth += 1
-        if depth < 0:
-            raise Refusal("joints of one skin have no common node above them")
-        wanted = {node for line in lines for node in line[depth:]}
-        return [node for node in self.walk(lines[0][depth]) if node in wanted]
-
-    def walk(self, root: int) -> Iterator[int]:
-        """Go through a node and all below it, parents first, depth first."""
-        waiting = [root]
-        while waiting:
-            node = waiting.pop()
-            yield node
-            waiting += reversed(self.get("nodes", node).get("children", ()))
+    def nodes(self) -> parts.NodeTree:
+        """The tree of the nodes."""
+        return parts.NodeTree({k: node.get("children", ()) for k, node in enumerate(self.all("nodes"))})
 
     def chain(self, line: Sequence[int]) -> Array:
         """Return what takes the first node's frame to the frame that the last is in, (4, 4)."""
@@ -348,7 +311,7 @@ def _read_table(gltf: Gltf, entry: Json, shape: tuple[int, int], dtype: np.dtype
     return np.ndarray(shape, dtype, data, offset, (stride, dtype.itemsize))
 
 
-def _bind_worlds(gltf: Gltf, armature: parts.Armature[int], worlds: Array, outer: Array) -> Array | None:
+def _bind_worlds(gltf: Gltf, armature: parts.Armature, worlds: Array, outer: Array) -> Array | None:
     """Return world matrices (joints, 4, 4) of the pose in which the skins are bound, as far as they agree with the
     nodes' bones; None where they do not, or are not said.
 
@@ -404,7 +367,7 @@ def read_bones(gltf: Gltf) -> dict[str, int]:
     return {bone["bone"]: bone["node"] for bone in bones}
 
 
-def find_armatures(gltf: Gltf) -> list[parts.Armature[int]]:
+def find_armatures(gltf: Gltf) -> list[parts.Armature]:
     """Find the armatures of a file; Refusal where nothing marks nodes as joints, or they are no tree."""
     skins, groups = gltf.all("skins"), list[tuple[set[int], list[int]]]()
     targets = [c["target"] for animation in gltf.all("animations") for c in animation.get("channels", ())]
@@ -414,7 +377,7 @@ def find_armatures(gltf: Gltf) -> list[parts.Armature[int]]:
     for number, skin in enumerate(skins):
         for node in skin["joints"]:
             gltf.get("nodes", node)
-        joints = set(gltf.connect(skin["joints"]))
+        joints = set(gltf.nodes.connect(skin["joints"]))
         near = [group for group in groups if group[0] & joints or _share_line(gltf, group[0], joints)]
         groups = [group for group in groups if group not in near]
         groups.append((joints.union(*(g[0] for g in near)), sorted({number, *(s for g in near for s in g[1])})))
@@ -424,8 +387,8 @@ def find_armatures(gltf: Gltf) -> list[parts.Armature[int]]:
 
 def _share_line(gltf: Gltf, first: set[int], second: set[int]) -> bool:
     """Return whether one set of joints hangs below the other: a hat's skin below the head's joint."""
-    tops = [min(nodes, key=lambda node: len(gltf.line(node))) for nodes in (first, second)]
-    return bool(set(gltf.line(tops[0])) & second or set(gltf.line(tops[1])) & first)
+    tops = [min(nodes, key=lambda node: len(gltf.nodes.line(node))) for nodes in (first, second)]
+    return bool(set(gltf.nodes.line(tops[0])) & second or set(gltf.nodes.line(tops[1])) & first)
 
 
 def _find_bare_joints(gltf: Gltf, animated: set[int]) -> list[set[int]]:
@@ -440,32 +403,32 @@ def _find_bare_joints(gltf: Gltf, animated: set[int]) -> list[set[int]]:
         raise Refusal("has no skin, no humanoid and no animation, so nothing in it marks nodes as a character's joints")
     tops: dict[int, list[int]] = {}
     for node in sorted(animated):
-        tops.setdefault(gltf.line(node)[-1], []).append(node)
+        tops.setdefault(gltf.nodes.line(node)[-1], []).append(node)
     bodies = [moved for moved in tops.values() if len(moved) > 1] or list(tops.values())
-    walks = [(set(moved), gltf.walk(gltf.connect(moved)[0])) for moved in bodies]
+    walks = [(set(moved), gltf.nodes.walk(gltf.nodes.connect(moved)[0])) for moved in bodies]
     return [{n for n in below if n in moved or gltf.get("nodes", n).get("children")} for moved, below in walks]
 
 
-def _build_armature(gltf: Gltf, joints: set[int], skins: list[int], animated: set[int]) -> parts.Armature[int]:
+def _build_armature(gltf: Gltf, joints: set[int], skins: list[int], animated: set[int]) -> parts.Armature:
     """Build the tree of a group's joints; its root is the topmost node above them that any animation moves."""
     nodes, bones = gltf.all("nodes"), set(read_bones(gltf).values())
-    own = gltf.connect(joints)
-    wanted = set(gltf.connect([*own, *(bones & set(gltf.walk(own[0])))]))
-    moved = [node for node in gltf.line(own[0])[1:] if node in animated]
+    own = gltf.nodes.connect(joints)
+    wanted = set(gltf.nodes.connect([*own, *(bones & set(gltf.nodes.walk(own[0])))]))
+    moved = [node for node in gltf.nodes.line(own[0])[1:] if node in animated]
     if moved:
-        wanted |= {node for node in gltf.line(own[0]) if moved[-1] in gltf.line(node)}
-    order = [node for node in gltf.walk(moved[-1] if moved else own[0]) if node in wanted]
+        wanted |= {node for node in gltf.nodes.line(own[0]) if moved[-1] in gltf.nodes.line(node)}
+    order = [node for node in gltf.nodes.walk(moved[-1] if moved else own[0]) if node in wanted]
     if len(order) > parts.MAX_JOINTS:
         raise Refusal(f"an armature has {len(order)} joints, allowed are {parts.MAX_JOINTS}")
     index_of = {node: index for index, node in enumerate(order)}
-    parents = tuple(-1 if node == order[0] else index_of[gltf.parent[node]] for node in order)
+    parents = tuple(-1 if node == order[0] else index_of[gltf.nodes.parent[node]] for node in order)
     ends = {}
     for node in order:
         children = nodes[node].get("children", ())
         tips = [child for child in children if child not in index_of and nodes[child].get("mesh") is None]
         if len(tips) == 1 and not any(child in index_of for child in children):
             ends[index_of[node]] = tips[0]
-    above = [nodes[k] for k in (gltf.parent.get(order[0]), order[0]) if k is not None]  # exporters name it there
+    above = [nodes[k] for k in (gltf.nodes.parent.get(order[0]), order[0]) if k is not None]  # exporters name it there
     named = [*(gltf.get("skins", skin) for skin in skins[:1]), *above]
     name = next((str(one["name"]) for one in named if one.get("name")), f"armature_{order[0]}")
     return parts.Armature(name, order, parents, ends, skins)
@@ -577,7 +540,7 @@ def _sample_tracks(gltf: Gltf, nodes: Sequence[int], tracks: Sequence[Track]) ->
     return fps, matrices
 
 
-def _read_parts(gltf: Gltf, armature: parts.Armature[int]) -> Iterator[parts.MeshPart]:
+def _read_parts(gltf: Gltf, armature: parts.Armature) -> Iterator[parts.MeshPart]:
     """Read what the armature's skins carry, and what hangs on its joints rigidly."""
     index_of = {node: joint for joint, node in enumerate(armature.nodes)}
     for number, node in enumerate(gltf.all("nodes")):
@@ -589,7 +552,7 @@ def _read_parts(gltf: Gltf, armature: parts.Armature[int]) -> Iterator[parts.Mes
             inverse = _read_inverse_binds(gltf, skin)
             matrices = np.tile(np.eye(4), (len(joints), 1, 1)) if inverse is None else inverse
         else:
-            line = gltf.line(number)
+            line = gltf.nodes.line(number)
             above = next((above for above in line if above in index_of), None)
             if above is None or skin is not None:
                 continue

@@ -9,9 +9,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from mapctl.formats.sandbox import Refusal
 from mapctl.formats.text import MAX_POSES
 
 Array = np.ndarray
-Node = TypeVar("Node")
 MAX_JOINTS = 4096
 """Most joints of an armature."""
 MAX_CORNERS = 2**25
@@ -92,24 +91,75 @@ def find_name(file: str, names: Sequence[str], wanted: str | None, what: str) ->
 
 
 @dataclass(frozen=True, eq=False)
-class Armature(Generic[Node]):
+class NodeTree:
+    """The nodes of a file by number. Refusal where they are no tree."""
+
+    children: Mapping[int, Sequence[int]]
+    """What is below each node, in the file's order."""
+
+    @cached_property
+    def parent(self) -> dict[int, int]:
+        """The node that each node is a child of."""
+        parent: dict[int, int] = {}
+        for node, below in self.children.items():
+            for child in below:
+                if child not in self.children:
+                    raise Refusal(f"has no nodes[{child}], but {len(self.children)}")
+                if child in parent:
+                    raise Refusal(f"nodes[{child}] has two parents")
+                parent[child] = node
+        return parent
+
+    def line(self, node: int) -> list[int]:
+        """Return a node and all above it, up to the scene."""
+        found = [node]
+        while found[-1] in self.parent:
+            found.append(self.parent[found[-1]])
+            if len(found) > MAX_JOINTS:
+                raise Refusal(f"nodes[{node}] is below itself, or below more than {MAX_JOINTS} others")
+        return found
+
+    def connect(self, nodes: Iterable[int]) -> list[int]:
+        """Return these nodes, what lies between them, and their common root, parents first."""
+        lines = [self.line(node)[::-1] for node in set(nodes)]
+        depth = -1
+        for level in zip(*lines, strict=False):
+            if len(set(level)) > 1:
+                break
+            depth += 1
+        if depth < 0:
+            raise Refusal("joints of one skin have no common node above them")
+        wanted = {node for line in lines for node in line[depth:]}
+        return [node for node in self.walk(lines[0][depth]) if node in wanted]
+
+    def walk(self, root: int) -> Iterator[int]:
+        """Go through a node and all below it, parents first, depth first."""
+        waiting = [root]
+        while waiting:
+            node = waiting.pop()
+            yield node
+            waiting += reversed(self.children[node])
+
+
+@dataclass(frozen=True, eq=False)
+class Armature:
     """A connected tree of nodes that are one character's joints."""
 
     name: str
     """Name by which it is chosen."""
-    nodes: Sequence[Node]
-    """Its nodes, parents first; the first is the root."""
+    nodes: Sequence[int]
+    """Numbers of its nodes, parents first; the first is the root."""
     parents: tuple[int, ...]
     """Index among `nodes` of each one's parent, -1 for the root."""
-    ends: dict[int, Node]
-    """Node that is the End Site of a last joint, by that joint's index among `nodes`."""
+    ends: dict[int, int]
+    """Number of the node that is the End Site of a last joint, by that joint's index among `nodes`."""
     skins: Sequence[int] = ()
     """Skins that it carries, where the format numbers them."""
 
 
 def choose_armature(
-    path: str | PathLike[str], armatures: Sequence[Armature[Node]], wanted: str | None
-) -> tuple[list[str], Armature[Node]]:
+    path: str | PathLike[str], armatures: Sequence[Armature], wanted: str | None
+) -> tuple[list[str], Armature]:
     """Return the armatures' names, unique, and the wanted one, as `find_name` does."""
     names = make_unique([armature.name for armature in armatures])
     number = find_name(Path(path).name, names, wanted, "armature")

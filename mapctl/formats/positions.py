@@ -181,35 +181,27 @@ def _is_number(words: list[str]) -> bool:
 
 
 def _find_columns(header: list[list[str]]) -> tuple[list[str], list[int]]:
-    """Find the markers of a table and the columns of their coordinates, by the header's rows."""
+    """Find the markers of a table and the columns of their coordinates, by the header's last row that has name.x,
+    name.y, name.z, or X, Y, Z; the names of the latter are above: in the row called Name, else in the next one."""
     names, columns = [], []
     for n in reversed(range(len(header))):
-        row = [word.strip() for word in header[n]]
-        lower = [word.lower() for word in row]
-        triples = [c for c in range(len(row) - 2) if lower[c : c + 3] == ["x", "y", "z"]]
-        if triples:  # names stand above: in the row called Name, else in the next one; rotations have columns as well
-            above = header[:n]
-            titles = next(
-                (r for r in above if "name" in [word.strip().lower() for word in r[:2]]), above[-1] if above else []
-            )
-            kinds = next((r for r in above if "Position" in r), None)
-            for c in triples:
-                name = titles[c].strip() if c < len(titles) else ""
-                if name and (kinds is None or (c < len(kinds) and kinds[c] == "Position")):
-                    names.append(name)
-                    columns += [c, c + 1, c + 2]
-            return names, columns
-        for c in range(len(row) - 2):
-            ends = [re.fullmatch(r"(.+?)[\s._:\-]*([xyz])", word, re.I) for word in row[c : c + 3]]
-            if (
-                all(ends)
-                and [e[2].lower() for e in ends if e] == ["x", "y", "z"]
-                and len({e[1] for e in ends if e}) == 1
-            ):
-                names.append(ends[0][1])  # pyright: ignore[reportOptionalSubscript]
+        ends = [re.fullmatch(r"(.*?)[\s._:\-]*([xyz])", word.strip(), re.I) for word in header[n]]
+        above = header[:n]
+        named = (row for row in above if "name" in [word.strip().lower() for word in row[:2]])
+        titles = next(named, above[-1] if above else [])
+        kinds = next((row for row in above if "Position" in row), None)  # rotations have columns as well
+        for c in range(len(ends) - 2):
+            found = [end.groups() for end in ends[c : c + 3] if end]
+            if [axis.lower() for _, axis in found] != ["x", "y", "z"] or len({name for name, _ in found}) > 1:
+                continue
+            name = found[0][0]
+            if not name and c < len(titles) and (kinds is None or kinds[c : c + 1] == ["Position"]):
+                name = titles[c].strip()
+            if name:
+                names.append(name)
                 columns += [c, c + 1, c + 2]
         if names:
-            return names, columns
+            break
     return names, columns
 
 

@@ -8,6 +8,7 @@ without torch.
 # pyright: reportAttributeAccessIssue=false
 
 import errno
+import itertools
 import os
 import re
 from collections.abc import Collection
@@ -147,7 +148,9 @@ def _check_layers(root: Sdf.Layer, folder: Path) -> None:
     waiting, seen = [root], {root.identifier}
     while waiting:
         layer = waiting.pop()
-        for name in sorted(_named_layers(layer)):
+        assets = itertools.chain(*UsdUtils.ExtractExternalReferences(layer.identifier))  # of value clips, too
+        layers = [*layer.GetCompositionAssetDependencies(), *(a for a in assets if a.lower().endswith(ENDINGS))]
+        for name in sorted(set(filter(None, layers))):
             full = layer.ComputeAbsolutePath(name)
             if full in seen:
                 continue
@@ -181,21 +184,6 @@ def first_reason(error: Exception) -> str:
     found = _REASON.search(text)
     text = found[1] if found else text
     return " ".join(text.split())[:160] or "no reason given"
-
-
-def _named_layers(layer: Sdf.Layer) -> set[str]:
-    """Return the layers that a layer names: those it is composed of, and those of value clips."""
-    found = {name for name in layer.GetCompositionAssetDependencies() if name}
-    copied = Sdf.Layer.CreateAnonymous(".usda")
-    copied.TransferContent(layer)
-
-    def note(name: str) -> str:
-        if name.lower().endswith(ENDINGS):
-            found.add(name)
-        return name
-
-    UsdUtils.ModifyAssetPaths(copied, note)
-    return found
 
 
 @dataclass(frozen=True, eq=False)

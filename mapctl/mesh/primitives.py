@@ -1,8 +1,7 @@
-"""Coloured triangles, the unit sphere and frames along vectors."""
+"""Coloured triangles, and frames along vectors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 
@@ -33,23 +32,6 @@ def merge_surfaces(surfaces: Sequence[Surface]) -> Surface:
         rgba=np.concatenate([s.rgba for s in surfaces]),
         normals=np.concatenate([s.normals for s in surfaces if s.normals is not None]) if lit else None,
     )
-
-
-@cache
-def unit_sphere(around: int = 16, up: int = 10) -> tuple[Array, Array]:
-    """Return the unit sphere (n, 3) about the y axis and its triangles."""
-    polar = (np.arange(up) + 0.5) * np.pi / up
-    turn = (np.arange(around) + 0.5) * 2 * np.pi / around
-    ring = np.stack([np.sin(turn), np.zeros(around), np.cos(turn)], axis=-1)
-    points = np.sin(polar)[:, None, None] * ring + np.cos(polar)[:, None, None] * np.array([0.0, 1.0, 0.0])
-    index = np.arange(up * around).reshape(up, around)
-    a, b = index[:-1], index[1:]
-    right = [np.roll(a, -1, axis=1), np.roll(b, -1, axis=1)]
-    quads = np.stack([a, b, right[1], right[0]], axis=-1).reshape(-1, 4)
-    sides = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-    fan = np.stack([np.zeros(around - 2, int), np.arange(1, around - 1), np.arange(2, around)], axis=-1)
-    caps = np.concatenate([index[0][fan], index[-1][fan[:, ::-1]]])
-    return points.reshape(-1, 3), np.concatenate([sides, caps])
 
 
 def frame_along(axis: Array, across: Array) -> Array:
