@@ -13,7 +13,6 @@ bone that a frame leaves out keeps its last values, at first those of the rest p
 `:FULLY-SPECIFIED`, where only bones that it never names may be missing.
 """
 
-from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -31,6 +30,7 @@ from mapctl import rotations
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.formats import euler, missing
 from mapctl.formats.missing import MissingValues
+from mapctl.formats.parts import NodeTree
 from mapctl.formats.text import MAX_POSES, NUMBER, check_extent, decode, finite_number, read_bytes, shorten
 from mapctl.formats.units import FASTEST, SLOWEST, FileUnit, guess_unit
 from mapctl.motion import Motion
@@ -324,7 +324,7 @@ class _AsfReader:
                 self.fail(f"more than {MAX_BONES} bones, which is the most allowed", bone.line)
             index[bone.name.lower()] = number
         parents: dict[int, int] = {}
-        children: dict[int, list[int]] = {}
+        children: dict[int, list[int]] = {number: [] for number in range(len(bones))}
         for line, words in section:
             if words[0].lower() in ("begin", "end") and len(words) == 1:
                 continue
@@ -336,11 +336,8 @@ class _AsfReader:
                 if bone == 0 or bone in parents:
                     self.fail(f"{shorten(bones[bone].name)} has a second parent", line)
                 parents[bone] = above
-                children.setdefault(above, []).append(bone)
-        order, waiting = [], [0]
-        while waiting:
-            order.append(waiting.pop())
-            waiting += reversed(children.get(order[-1], []))
+                children[above].append(bone)
+        order = list(NodeTree(children).walk(0))
         for number in sorted(set(range(len(bones))) - set(order))[:1]:
             bone = bones[number]
             self.fail(f"the bone {shorten(bone.name)} does not hang on the root in :hierarchy", bone.line)
@@ -387,19 +384,8 @@ def read_amc(
     counts = [len(bone.channels) for bone in skeleton.bones]
     starts = np.cumsum([0, *counts])[:-1].tolist()
     bones = {bone.name.lower(): number for number, bone in enumerate(skeleton.bones)}
-    row, values = array("d", bytes(8 * sum(counts))), array("d")
+    frames, values, line = list[tuple[int, int, set[int]]](), list[np.ndarray](), 1  # line, number, and bones of each
     degrees, fps, full = None, None, False
-    frames, number, begun, line = 0, 0, 0, 1
-    seen, expected = set[int](), set[int]()
-
-    def keep_frame() -> None:
-        if 0 not in seen:
-            fail(f"frame {number} has no line for the root", begun)
-        if full and seen != expected:
-            bone = shorten(skeleton.bones[min(seen ^ expected)].name)
-            fail(f"not every frame up to {number} holds {bone}, but the file is declared fully specified", begun)
-        values.extend(row)
-
     for line, words in rows(decode(path, read_bytes(path), "AMC text")[0]):
         word, shown = words[0].lower(), shorten(words[0])
         if word.startswith(":"):
@@ -417,22 +403,21 @@ def read_amc(
                     fail(f"expected {SLOWEST:g} to {FASTEST:g} samples a second, got {got}", line)
             full = full or word == ":fully-specified"
         elif len(words) == 1 and word.isdecimal() and word.isascii():
-            if frames:
-                expected = expected or seen
-                keep_frame()
-            following = int(word) if len(word) <= 9 else -1
-            if following < 0 or (frames and following != number + 1):
-                wanted = f"frame {number + 1} after frame {number}" if frames else "a frame's number"
+            number = int(word) if len(word) <= 9 else -1
+            if number < 0 or (frames and number != frames[-1][1] + 1):
+                before = frames[-1][1] if frames else 0
+                wanted = f"frame {before + 1} after frame {before}" if frames else "a frame's number"
                 fail(f"expected {wanted}, got {shown}", line)
-            frames, number, begun, seen = frames + 1, following, line, set()
-            if frames * max(len(row), len(bones)) > MAX_POSES:
+            if (len(frames) + 1) * max(sum(counts), len(bones)) > MAX_POSES:
                 fail(f"more than {MAX_POSES} values, which is the most allowed", line)
+            frames.append((line, number, set()))
+            values.append(values[-1].copy() if values else np.zeros(sum(counts)))
         else:
             if not frames:
                 fail(f"expected the number of the first frame, got {shown}", line)
             if word not in bones:
                 fail(f"the skeleton has no bone {shown}", line)
-            bone = bones[word]
+            bone, (_, number, seen) = bones[word], frames[-1]
             if bone in seen:
                 fail(f"a second line for {shown} in frame {number}", line)
             if len(words) - 1 != counts[bone]:
@@ -442,12 +427,15 @@ def read_amc(
                 if value is None:
                     got = f"{shorten(text)}{missing.missing_hint(text)}"
                     fail(f"{shown} {skeleton.bones[bone].channels[channel]}: expected {NUMBER}, got {got}", line)
-                row[starts[bone] + channel] = value
+                values[-1][starts[bone] + channel] = value
             seen.add(bone)
     if not frames:
         fail("holds no frame, expected a line with the number 1", line)
-    expected = expected or seen
-    keep_frame()
+    for begun, number, seen in frames:
+        if 0 not in seen:
+            fail(f"frame {number} has no line for the root", begun)
+        if full and seen != frames[0][2]:
+            bone = shorten(skeleton.bones[min(seen ^ frames[0][2])].name)
+            fail(f"not every frame up to {number} holds {bone}, but the file is declared fully specified", begun)
     rate = None if fps is None else Fraction(fps).limit_denominator(100_000)
-    table = np.frombuffer(values).reshape(frames, len(row))
-    return table, skeleton.degrees if degrees is None else degrees, rate
+    return np.stack(values), skeleton.degrees if degrees is None else degrees, rate

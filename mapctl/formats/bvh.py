@@ -27,7 +27,7 @@ from mapctl.errors import FileFormatError, RequestError
 from mapctl.formats import euler, missing
 from mapctl.formats.atomic import write_bytes
 from mapctl.formats.missing import MissingValues
-from mapctl.formats.parts import make_unique
+from mapctl.formats.parts import NodeTree, make_unique
 from mapctl.formats.text import (
     LARGEST_VALUE,
     NUMBER,
@@ -678,11 +678,8 @@ def _widen_channels(channels: tuple[str, ...], quat_xyzw: np.ndarray, *, add_pos
 
 def _default_layout(motion: Motion) -> BvhLayout:
     """Return a layout with root OFFSET 0, joints depth first as BVH nests them (the canonical order is not)."""
-    skeleton, moving = motion.skeleton, motion.moving_offsets
-    order, waiting, unit = [], [0], _written_unit(motion)
-    while waiting:
-        order.append(waiting.pop())
-        waiting += reversed(skeleton.children(order[-1]))
+    skeleton, moving, unit = motion.skeleton, motion.moving_offsets, _written_unit(motion)
+    order = list(NodeTree({joint: skeleton.children(joint) for joint in range(motion.num_joints)}).walk(0))
     channels = [(POSITIONS if j == 0 or j in moving else ()) + ROTATIONS for j in order]
     offsets = [_in_unit(skeleton.offsets[j].tolist(), unit) if j else (0.0, 0.0, 0.0) for j in order]
     parents = [order.index(skeleton.parents[j]) if j else -1 for j in order]

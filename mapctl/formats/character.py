@@ -25,7 +25,6 @@ STILL_METRES = 1e-5
 """A joint whose offset varies by less stays still; files of 32-bit numbers round to 1e-7 of a body."""
 NEW_NODE = -1
 """Placeholder for the node of a joint that is yet to be added to the file."""
-_FARTHEST = 1e6  # metres
 _LARGEST = 1e12  # whatever the unit
 _MAX_VERTICES = 2**23
 _MOST_CARRIERS = 4  # joints of a vertex, as every engine takes them
@@ -269,7 +268,7 @@ def _build_part(part: parts.MeshPart, frames: RestFrames) -> CharacterMesh:
     for row, share in zip(part.rows.T, part.shares.T, strict=True):
         moved = np.einsum("nab,nb->na", matrices[row][:, :3, :3], part.points) + matrices[row][:, :3, 3]
         vertices += share[:, None] * moved
-    if not np.isfinite(vertices).all() or np.abs(vertices).max() > _FARTHEST:
+    if not np.isfinite(vertices).all() or np.abs(vertices).max() > parts.FARTHEST:
         raise Refusal("its mesh holds numbers that are not finite, or larger than 1000 km")
     normals = compute_normals(vertices, part.faces)
     joints = part.joints[part.rows]

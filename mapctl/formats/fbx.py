@@ -12,7 +12,7 @@ import ufbx
 
 from mapctl.formats import parts, sandbox
 from mapctl.formats.sandbox import Refusal
-from mapctl.formats.units import frame_rate_of
+from mapctl.formats.units import USUAL_FPS, frame_rate_of
 
 Array = np.ndarray
 NEWEST, OLDEST = 7799, 3000
@@ -20,7 +20,6 @@ NEWEST, OLDEST = 7799, 3000
 _MAX_ELEMENTS = 2**20
 _BODY_JOINTS = 8
 """Two trees of at least as many joints, below one node and without a common skin, are two characters."""
-_USUAL_RATE = 30.0
 _MODE_119_88 = 18  # of the FBX SDK, which ufbx 0.0.5 reads as 24 frames a second
 _EARLY_SHARE = 0.02  # of a frame by which a take may end before it
 _MOVED = ("Lcl Translation", "Lcl Rotation", "Lcl Scaling")
@@ -257,7 +256,7 @@ def _sample(
     rate = scene.settings.frames_per_second
     if ufbx.find_int(scene.settings.props, "TimeMode", 0) == _MODE_119_88:
         rate = 120 / 1.001
-    rate = rate if np.isfinite(rate) and 0.01 <= rate <= 1e5 else _USUAL_RATE
+    rate = rate if np.isfinite(rate) and 0.01 <= rate <= 1e5 else float(USUAL_FPS)
     if abs(1.001 * rate - round(1.001 * rate)) < 1e-3:  # 29.97, which is rounded
         rate = round(1.001 * rate) / 1.001
     if not (np.isfinite(begin) and np.isfinite(end)) or end < begin:

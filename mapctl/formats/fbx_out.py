@@ -13,7 +13,6 @@ import numpy as np
 import torch
 
 from mapctl import rotations
-from mapctl.blender import WRITE_FBX
 from mapctl.errors import RequestError
 from mapctl.formats.atomic import atomic_path
 from mapctl.formats.character import build_skinned_body, character_of
@@ -22,6 +21,7 @@ from mapctl.motion import Motion
 
 BLENDER = "MAPCTL_BLENDER"
 """Environment variable that names a Blender, or a Python with bpy."""
+_SCRIPT = str(Path(__file__).resolve().parents[1] / "blender" / "write_fbx.py")
 NEEDED = (
     "FBX is written by Blender: install it from blender.org and put its program on PATH, or name it, or a Python with"
     f" the package bpy, by the environment variable {BLENDER}; or write .glb, .usda or .bvh"
@@ -35,8 +35,8 @@ def find_blender() -> list[str]:
     if program is None:
         raise RequestError(NEEDED if named == "blender" else f"{BLENDER} names {named}, which is no program")
     if Path(program).name.lower().startswith("python"):
-        return [program, WRITE_FBX]
-    return [program, "--background", "--factory-startup", "--python-exit-code", "1", "--python", WRITE_FBX, "--"]
+        return [program, _SCRIPT]
+    return [program, "--background", "--factory-startup", "--python-exit-code", "1", "--python", _SCRIPT, "--"]
 
 
 def save(motion: Motion, path: str | PathLike[str]) -> None:

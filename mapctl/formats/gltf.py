@@ -29,6 +29,7 @@ from mapctl import kinematics, rotations
 from mapctl.errors import RequestError
 from mapctl.formats import parts
 from mapctl.formats.atomic import write_bytes
+from mapctl.formats.bvh import all_translations
 from mapctl.formats.character import CharacterSource, build_skinned_body, character_of
 from mapctl.formats.sandbox import Refusal
 from mapctl.formats.text import MAX_FILE_BYTES, check_ordinary, one_line, read_bytes, shorten, warn_once
@@ -830,10 +831,7 @@ def _compose(motion: Motion, bones: Mapping[str, int] | None = None, root_at_res
 
 def _build_nodes(motion: Motion) -> list[Json]:
     """Build a node for each joint, in file order, then one for each End Site."""
-    skeleton, offsets = motion.skeleton, motion.skeleton.offsets.clone()
-    offsets[0] = motion.root_position[0]
-    for joint, track in motion.moving_offsets.items():
-        offsets[joint] = track[0]
+    skeleton, offsets = motion.skeleton, all_translations(motion)[0]
     below = [skeleton.children(joint) for joint in range(motion.num_joints)]
     for number, name in enumerate(skeleton.end_offsets):
         below[skeleton.index(name)].append(motion.num_joints + number)

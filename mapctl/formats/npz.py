@@ -68,7 +68,9 @@ def read(
     from mapctl.formats import smpl  # which reads arrays by this module
 
     raw = read_bytes(path)
-    if not set(smpl.POSES).isdisjoint(_list_keys(path, raw)):
+    with _open_archive(path, raw) as archive:
+        is_smpl = not set(smpl.POSES).isdisjoint(archive.files)
+    if is_smpl:
         motion = smpl.build_motion(path, read_arrays(path, raw, (), smpl.KEYS), fps=fps)
         return motion, MissingValues.none(motion.num_frames, motion.num_joints)
     if fps is not None:
@@ -143,11 +145,6 @@ def read_arrays(
         if (total := sum(archive.zip.getinfo(f"{key}.npy").file_size for key in keys)) > MAX_FILE_BYTES:
             raise FileFormatError(path, f"unpacks to {total >> 20} MiB, allowed are {MAX_FILE_BYTES >> 20}")
         return {key: archive[key] for key in keys}
-
-
-def _list_keys(path: str | PathLike[str], raw: bytes) -> list[str]:
-    with _open_archive(path, raw) as archive:
-        return list(archive.files)
 
 
 @contextmanager

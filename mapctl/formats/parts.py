@@ -30,7 +30,8 @@ MOST_CARRIERS = 8
 """Most joints that carry one vertex; weaker ones are left out."""
 _MAX_NAMED = 8
 _MAX_PIXELS = 2**26
-_FARTHEST = 1e6  # metres
+FARTHEST = 1e6
+"""Largest coordinate of a joint or a vertex, metres."""
 _BONE_SHARE = 0.02  # of a bone's length by which it may differ between bind pose and nodes
 
 
@@ -229,7 +230,7 @@ class UnevenScaleError(Refusal):
 def check_size(*tables: Array) -> None:
     """Refuse matrices (..., 4, 4) that are not finite and within 1000 km."""
     for table in tables:
-        if not np.isfinite(table).all() or np.abs(table).max(initial=0.0) > _FARTHEST:
+        if not np.isfinite(table).all() or np.abs(table).max(initial=0.0) > FARTHEST:
             raise Refusal("its joints are at positions that are not finite, or larger than 1000 km")
 
 
@@ -255,7 +256,7 @@ def compose_matrices(translations: Array, quat_xyzw: Array, scales: Array) -> Ar
 def compose_transforms(transforms: Array) -> Array:
     """Return matrices (..., 4, 4) of translation, rotation xyzw and scale (..., 10). Refusal where they are not finite,
     or larger than 1000 km."""
-    if not np.isfinite(transforms).all() or np.abs(transforms).max(initial=0.0) > _FARTHEST:
+    if not np.isfinite(transforms).all() or np.abs(transforms).max(initial=0.0) > FARTHEST:
         raise Refusal("its animation holds numbers that are not finite, or larger than 1000 km")
     if np.linalg.norm(transforms[..., 3:7], axis=-1).min(initial=1.0) < 1e-6:
         raise Refusal("its animation holds a rotation of length zero")

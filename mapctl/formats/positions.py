@@ -22,12 +22,11 @@ from jaxtyping import Float
 from mapctl.errors import FileFormatError, RequestError
 from mapctl.formats.missing import MissingValues
 from mapctl.formats.text import LARGEST_VALUE, check_extent, decode, one_line, read_bytes, shorten, warn_once
-from mapctl.formats.units import FASTEST, SLOWEST
+from mapctl.formats.units import FASTEST, SLOWEST, USUAL_FPS
 from mapctl.motion import Motion
 
 _UNITS = {"m": 1.0, "meters": 1.0, "metres": 1.0, "dm": 0.1, "cm": 0.01, "centimeters": 0.01, "mm": 0.001}
 _UNITS |= {"millimeters": 0.001, "millimetres": 0.001, "in": 0.0254, "inches": 0.0254}
-_ASSUMED_FPS = 30
 _BODY = (
     "pelvis lefthip righthip spine1 leftknee rightknee spine2 leftankle rightankle spine3 lefttoe righttoe neck"
     " leftcollar rightcollar head leftshoulder rightshoulder leftelbow rightelbow leftwrist rightwrist"
@@ -158,13 +157,11 @@ def _read_csv(path: str | PathLike[str], fps: Fraction | float | None) -> Captur
     _check_one_rate(path, fps, stated)
     rate = fps or stated or 0.0
     if not rate:
-        warn_once(
-            f"{path}: states no frame rate: {_ASSUMED_FPS} a second are assumed; --fps-in of mapctl convert sets it"
-        )
+        warn_once(f"{path}: states no frame rate: {USUAL_FPS} a second are assumed; --fps-in of mapctl convert sets it")
     unit = next((word for row in header for word in row if word.strip().lower() in _UNITS and len(word) > 1), "")
     unit = above.get("length units", unit)
     positions = _parse_rows(path, body, np.array(columns), offset + first + 1)
-    return build_capture(path, names, positions, float(rate or _ASSUMED_FPS), unit)
+    return build_capture(path, names, positions, float(rate or USUAL_FPS), unit)
 
 
 def _check_one_rate(path: str | PathLike[str], fps: Fraction | float | None, stated: float | None) -> None:
@@ -259,10 +256,10 @@ def _read_npy(path: str | PathLike[str], fps: Fraction | float | None) -> Captur
     _check_one_rate(path, fps, rate)
     rate = fps or rate
     if not rate:
-        notes.append(f"{_ASSUMED_FPS} frames a second are assumed; --fps-in of mapctl convert sets them")
+        notes.append(f"{USUAL_FPS} frames a second are assumed; --fps-in of mapctl convert sets them")
     if notes:
         warn_once(f"{path}: {'; '.join(notes)}")
-    return build_capture(path, names, values, float(rate or _ASSUMED_FPS))
+    return build_capture(path, names, values, float(rate or USUAL_FPS))
 
 
 def _measure_flexing(positions: Float[np.ndarray, "frames joints 3"], names: list[str]) -> float:

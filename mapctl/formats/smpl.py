@@ -35,7 +35,7 @@ from mapctl.formats.missing import MissingValues
 from mapctl.formats.npz import read_arrays
 from mapctl.formats.parts import nearest_rotations
 from mapctl.formats.text import LARGEST_VALUE, one_line, read_bytes, warn_once
-from mapctl.formats.units import FASTEST, SLOWEST
+from mapctl.formats.units import FASTEST, SLOWEST, USUAL_FPS
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
 
@@ -76,7 +76,6 @@ _SAME_REST = 0.7  # cosine between bones of rest poses that count as the same
 JOINTS = (24, 52, 55)
 """Numbers of joints of SMPL, SMPL-H and SMPL-X."""
 _RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
-_USUAL_RATE = Fraction(30)
 _GLOBAL = "smpl_params_global"  # of GVHMR: Y up
 _WHOLE = {"poses": "trans", "pose_world": "trans_world"}  # rotations of all joints, and their translation
 _PARTS = {  # numbers of joints
@@ -280,11 +279,9 @@ def _read_rate(path: str | PathLike[str], arrays: Mapping[str, np.ndarray], fps:
     if found is not None and fps is not None:
         raise RequestError(f"{path}: has a frame rate of its own, {found!s:.40}; leave the requested one out")
     if found is None and fps is None:
-        warn_once(
-            f"{path}: has no frame rate: {_USUAL_RATE} frames a second are assumed; see --fps-in of mapctl convert"
-        )
+        warn_once(f"{path}: has no frame rate: {USUAL_FPS} frames a second are assumed; see --fps-in of mapctl convert")
     try:
-        rate = Fraction(float(found if found is not None else fps or _USUAL_RATE)).limit_denominator(1001)
+        rate = Fraction(float(found if found is not None else fps or USUAL_FPS)).limit_denominator(1001)
     except (TypeError, ValueError, OverflowError):
         rate = Fraction(0)
     if not SLOWEST <= rate <= FASTEST:

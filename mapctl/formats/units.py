@@ -130,7 +130,7 @@ def frame_rate(frame_time: str) -> Fraction:
 
 
 USUAL_FPS = Fraction(30)
-"""Frames per second of animations whose keys show no rate."""
+"""Frames per second of a file that neither states nor shows them."""
 _UNEVEN_SHARE = 0.02  # of a frame that a key may lie beside it
 
 

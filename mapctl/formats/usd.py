@@ -97,14 +97,9 @@ def _place_rest(skeleton: "SkeletonPrim", outer: Array, stage: Array) -> Array:
     UsdSkel defines the former in the world of the time of binding, and skins as if that were the skeleton's space; it
     is taken for the space in which bones are as long as in the latter.
     """
-    bind, rest, parents = skeleton.bind, skeleton.rest, skeleton.parents
-    parts.check_size(outer, *(table for table in (bind, rest) if table is not None))
-    if rest is None:
-        assert bind is not None
-        return outer @ bind
-    worlds = parts.chain_matrices(parents, rest, outer)
-    if bind is None:
-        return worlds
+    bind, parents = skeleton.bind, skeleton.parents
+    parts.check_size(outer, bind, skeleton.rest)
+    worlds = parts.chain_matrices(parents, skeleton.rest, outer)
     found = parts.complete_bind_pose(parents, (dict(enumerate(space @ bind)) for space in (outer, stage)), worlds)
     if found is not None:
         return found
@@ -195,10 +190,10 @@ class SkeletonPrim:
     names: list[str]
     parents: list[int]
     """Index of each joint's parent, -1 where it has none."""
-    bind: Array | None
-    """(joints, 4, 4) of the pose in which skins are bound, in the skeleton's space; None where it has none."""
-    rest: Array | None
-    """(joints, 4, 4) of the pose of joints that nothing moves, in their parents' frames; None where it has none."""
+    bind: Array
+    """(joints, 4, 4) of the pose in which skins are bound, in the skeleton's space; `rest` where it has none."""
+    rest: Array
+    """(joints, 4, 4) of the pose of joints that nothing moves, in their parents' frames; `bind` where it has none."""
 
 
 def find_skeletons(stage: Usd.Stage) -> tuple[list[str], list[Usd.Prim]]:
@@ -224,8 +219,11 @@ def read_skeleton(prim: Usd.Prim) -> SkeletonPrim:
     said = [str(name) for name in read_value(skeleton.GetJointNamesAttr()) or ()]
     bind = _read_matrices(skeleton.GetBindTransformsAttr(), len(joints), where)
     rest = _read_matrices(skeleton.GetRestTransformsAttr(), len(joints), where)
-    if bind is None and rest is None:
-        raise Refusal(f"{where} has neither bindTransforms nor restTransforms")
+    if rest is None:
+        if bind is None:
+            raise Refusal(f"{where} has neither bindTransforms nor restTransforms")
+        rest = np.linalg.pinv([np.eye(4) if parent < 0 else bind[parent] for parent in parents]) @ bind
+    bind = parts.chain_matrices(parents, rest, np.eye(4)) if bind is None else bind
     if len(said) != len(joints) or len(set(said)) < len(said) or not all(said):
         said = [joint.rpartition("/")[2] for joint in joints]
     names = said if len(set(said)) == len(joints) else joints
@@ -375,13 +373,8 @@ def _sample_joints(
 
 
 def _rest_parts(skeleton: SkeletonPrim) -> Array:
-    """Return translation, rotation xyzw and scale (joints, 10) of the pose of joints that nothing moves: that which the
-    skeleton has, else the one in which skins are bound."""
+    """Return translation, rotation xyzw and scale (joints, 10) of the pose of joints that nothing moves."""
     matrices = skeleton.rest
-    if matrices is None:
-        assert skeleton.bind is not None
-        above = [np.eye(4) if parent < 0 else skeleton.bind[parent] for parent in skeleton.parents]
-        matrices = np.linalg.pinv(np.array(above)) @ skeleton.bind
     scales = np.linalg.norm(matrices[:, :3, :3], axis=1)
     scales *= np.where(np.linalg.det(matrices[:, :3, :3]) < 0, -1.0, 1.0)[:, None]
     turns = matrices[:, :3, :3] / np.where(abs(scales) > 1e-12, scales, 1.0)[:, None, :]
@@ -534,11 +527,7 @@ def _read_palette(query: UsdSkel.SkinningQuery, skeleton: SkeletonPrim) -> tuple
     names = skeleton.joints if order is None else [str(joint) for joint in order]
     joints = np.array([index_of.get(name, 0) for name in names])
     geometry = np.array(query.GetGeomBindTransform() or Gf.Matrix4d(1.0)).T
-    bind = skeleton.bind
-    if bind is None:
-        assert skeleton.rest is not None
-        bind = parts.chain_matrices(skeleton.parents, skeleton.rest, np.eye(4))
-    return joints, np.linalg.pinv(bind[joints]) @ geometry
+    return joints, np.linalg.pinv(skeleton.bind[joints]) @ geometry
 
 
 def _read_carriers(query: UsdSkel.SkinningQuery, count: int, what: str) -> tuple[Array, Array]:
