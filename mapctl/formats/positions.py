@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mapctl.errors import FileFormatError, RequestError
+from mapctl.errors import FileFormatError
 from mapctl.formats.missing import MissingValues
 from mapctl.formats.text import LARGEST_VALUE, check_extent, decode, one_line, read_bytes, shorten, warn_once
-from mapctl.formats.units import FASTEST, SLOWEST, USUAL_FPS
+from mapctl.formats.units import FASTEST, SLOWEST, choose_rate
 from mapctl.motion import Motion
 
 _UNITS = {"m": 1.0, "meters": 1.0, "metres": 1.0, "dm": 0.1, "cm": 0.01, "centimeters": 0.01, "mm": 0.001}
@@ -153,20 +153,11 @@ def _read_csv(path: str | PathLike[str], fps: Fraction | float | None) -> Captur
             path, "is no CSV of positions: expected columns name.x, name.y, name.z, or X, Y, Z under names"
         )
     above = dict(itertools.pairwise(word.strip().lower() for row in header for word in row))
-    stated = _find_rate(header, body)
-    _check_one_rate(path, fps, stated)
-    rate = fps or stated or 0.0
-    if not rate:
-        warn_once(f"{path}: states no frame rate: {USUAL_FPS} a second are assumed; --fps-in of mapctl convert sets it")
+    rate = choose_rate(path, _find_rate(header, body), fps)
     unit = next((word for row in header for word in row if word.strip().lower() in _UNITS and len(word) > 1), "")
     unit = above.get("length units", unit)
     positions = _parse_rows(path, body, np.array(columns), offset + first + 1)
-    return build_capture(path, names, positions, float(rate or USUAL_FPS), unit)
-
-
-def _check_one_rate(path: str | PathLike[str], fps: Fraction | float | None, stated: float | None) -> None:
-    if fps is not None and stated:
-        raise RequestError(f"{path}: states {stated:g} frames a second itself; leave --fps-in out")
+    return build_capture(path, names, positions, rate, unit)
 
 
 def _is_number(words: list[str]) -> bool:
@@ -238,7 +229,6 @@ def _read_npy(path: str | PathLike[str], fps: Fraction | float | None) -> Captur
     values = values.astype(np.float64)
     _check_values(path, values)
     names, rate = _read_names(Path(path))
-    notes = []
     if names is None:
         found = [name for name, joints in SETS.items() if len(joints) == values.shape[1]]
         if len(found) > 1 and len(values):
@@ -250,16 +240,10 @@ def _read_npy(path: str | PathLike[str], fps: Fraction | float | None) -> Captur
                 f"has {values.shape[1]} joints without names: list them in a .txt beside it; known sets have {known}",
             )
         names = SETS[found[0]]
-        notes.append(f"its {len(names)} joints are taken for those of {found[0]}")
+        warn_once(f"{path}: its {len(names)} joints are taken for those of {found[0]}")
     if len(names) != values.shape[1]:
         raise FileFormatError(path, f"has {values.shape[1]} joints, and the file of names beside it {len(names)}")
-    _check_one_rate(path, fps, rate)
-    rate = fps or rate
-    if not rate:
-        notes.append(f"{USUAL_FPS} frames a second are assumed; --fps-in of mapctl convert sets them")
-    if notes:
-        warn_once(f"{path}: {'; '.join(notes)}")
-    return build_capture(path, names, values, float(rate or USUAL_FPS))
+    return build_capture(path, names, values, choose_rate(path, rate, fps))
 
 
 def _measure_flexing(positions: Float[np.ndarray, "frames joints 3"], names: list[str]) -> float:

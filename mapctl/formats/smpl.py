@@ -35,7 +35,7 @@ from mapctl.formats.missing import MissingValues
 from mapctl.formats.npz import read_arrays
 from mapctl.formats.parts import nearest_rotations
 from mapctl.formats.text import LARGEST_VALUE, one_line, read_bytes, warn_once
-from mapctl.formats.units import FASTEST, SLOWEST, USUAL_FPS
+from mapctl.formats.units import FASTEST, SLOWEST, choose_rate
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, Skeleton
 
@@ -276,17 +276,13 @@ def _check_numbers(path: str | PathLike[str], key: str, values: np.ndarray) -> N
 
 def _read_rate(path: str | PathLike[str], arrays: Mapping[str, np.ndarray], fps: Fraction | float | None) -> Fraction:
     found = next((arrays[key] for key in _RATES if key in arrays), None)
-    if found is not None and fps is not None:
-        raise RequestError(f"{path}: has a frame rate of its own, {found!s:.40}; leave the requested one out")
-    if found is None and fps is None:
-        warn_once(f"{path}: has no frame rate: {USUAL_FPS} frames a second are assumed; see --fps-in of mapctl convert")
     try:
-        rate = Fraction(float(found if found is not None else fps or USUAL_FPS)).limit_denominator(1001)
-    except (TypeError, ValueError, OverflowError):
-        rate = Fraction(0)
-    if not SLOWEST <= rate <= FASTEST:
+        rate = choose_rate(path, None if found is None else float(found), fps)
+    except (TypeError, ValueError):
+        rate = 0.0
+    if not SLOWEST <= rate <= FASTEST:  # also of nan
         raise FileFormatError(path, f"has {found!s:.40} frames per second, allowed are {SLOWEST:g} to {FASTEST:g}")
-    return rate
+    return Fraction(rate).limit_denominator(1001)
 
 
 def save(motion: Motion, path: str | PathLike[str]) -> None:

@@ -6,8 +6,12 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
 from fractions import Fraction
+from os import PathLike
 
 import numpy as np
+
+from mapctl.errors import RequestError
+from mapctl.formats.text import warn_once
 
 UNITS = {
     "metres": 1.0,
@@ -132,6 +136,16 @@ def frame_rate(frame_time: str) -> Fraction:
 USUAL_FPS = Fraction(30)
 """Frames per second of a file that neither states nor shows them."""
 _UNEVEN_SHARE = 0.02  # of a frame that a key may lie beside it
+
+
+def choose_rate(path: str | PathLike[str], stated: float | None, requested: Fraction | float | None) -> float:
+    """Return frames per second: those that a file states or, where it states none, the requested ones, else USUAL_FPS
+    with a warning. RequestError where both are given."""
+    if stated is not None and requested is not None:
+        raise RequestError(f"{path}: has a frame rate of its own, {stated:g}; leave the requested one out")
+    if stated is None and requested is None:
+        warn_once(f"{path}: has no frame rate: {USUAL_FPS} frames a second are assumed; see --fps-in of mapctl convert")
+    return float(next((rate for rate in (stated, requested) if rate is not None), USUAL_FPS))
 
 
 def sample_times(keys: np.ndarray) -> tuple[Fraction, np.ndarray]:
