@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from mapctl.formats.character import RestFrames
-from mapctl.formats.parts import UnevenScaleError, chain_matrices
+from mapctl.formats.parts import NodeTree, UnevenScaleError, chain_matrices
+from mapctl.formats.sandbox import Refusal
 
 PARENTS = (-1, 0, 1, 1, 3)
 NAMES = ("a", "b", "c", "d", "e")
@@ -100,3 +101,12 @@ def test_a_last_joint_may_mirror(mirror):
     np.testing.assert_allclose(given.joint_positions(), wanted.joint_positions(), atol=1e-12)
     same = (given.joint_rotations() * wanted.joint_rotations()).sum(-1).abs()
     np.testing.assert_allclose(same, 1.0, atol=1e-12)
+
+
+def test_nodes_between_joints_are_joints():
+    tree = NodeTree({0: [1, 4], 1: [2], 2: [3], 3: [], 4: []})
+    assert tree.connect([3, 1]) == [1, 2, 3]
+    assert tree.connect([4, 3]) == [0, 1, 2, 3, 4]
+    for children, fault in (({0: [2], 1: [2], 2: []}, "two parents"), ({0: [1], 1: [0]}, "below itself")):
+        with pytest.raises(Refusal, match=fault):
+            NodeTree(children).line(0)

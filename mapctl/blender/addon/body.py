@@ -57,8 +57,6 @@ class Body:
     """Controls that are keyed on a generated rig; without any, `bones` are keyed."""
     switches: dict[str, str] = field(default_factory=dict)
     """Custom property of a bone of a generated rig that is keyed to 1, by bone."""
-    rig_toml: str = ""
-    """A rig file with names of the joints; nothing where mapctl recognises them itself."""
 
     def to_world(self, positions: np.ndarray) -> np.ndarray:
         """Convert positions (..., 3) in the armature's space to mapctl's, with the armature at the origin."""

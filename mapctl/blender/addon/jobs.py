@@ -29,6 +29,7 @@ from .body import (
 from .exchange import WorldMotion
 from .process import AddonError, Step, run_command
 
+_GIVEN, _RESULT = "given.npz", "result.npz"  # files of a command
 _LEVEL = 0.05  # metres that a level curve may rise and fall
 
 
@@ -235,7 +236,7 @@ def _ask_for_walk(
 
 def clean_up(at: Scene, frames: range, *, anchor: bool) -> Job:
     """Denoise the action in these frames."""
-    words = ["denoise", "IN", "-o", "OUT", *(["--capture", "video"] if anchor else [])]
+    words = ["denoise", _GIVEN, "-o", _RESULT, *(["--capture", "video"] if anchor else [])]
     generated = np.zeros(len(frames), dtype=bool)
     return (yield from _edit(at, frames, words, generated, "clean", "cleaning up"))
 
@@ -245,7 +246,7 @@ def fill_gap(at: Scene, frames: range, gap: range, joints: Sequence[str]) -> Job
     if not (gap and frames.start <= gap.start and gap.stop <= frames.stop):
         asked, own = (f"{each.start} to {each.stop - 1}" for each in (gap, frames))
         raise AddonError(f"the gap {asked} is not within the action's frames {own}")
-    words = ["infill", "IN", "-o", "OUT", "--gap", f"{gap.start - frames.start}:{gap.stop - frames.start}"]
+    words = ["infill", _GIVEN, "-o", _RESULT, "--gap", f"{gap.start - frames.start}:{gap.stop - frames.start}"]
     words += ["--joints", ",".join(joints)] if joints else []
     generated = np.array([frame in gap for frame in frames])
     return (yield from _edit(at, frames, words, generated, "filled", "filling the gap"))
@@ -258,7 +259,7 @@ def fill_between_keys(at: Scene, keyed: Sequence[int]) -> Job:
     if len(keyed) == keyed[-1] - keyed[0] + 1:
         raise AddonError(f"every frame from {keyed[0]} to {keyed[-1]} has keys: there is nothing in between")
     frames = range(keyed[0], keyed[-1] + 1)
-    words = ["tween", "IN", "-o", "OUT", "--keyframes", ",".join(str(frame - frames.start) for frame in keyed)]
+    words = ["tween", _GIVEN, "-o", _RESULT, "--keyframes", ",".join(str(frame - frames.start) for frame in keyed)]
     generated = np.array([frame not in keyed for frame in frames])
     return (yield from _edit(at, frames, words, generated, "in-between", "in-betweening"))
 
@@ -272,8 +273,7 @@ def take_body(at: Scene) -> Body:
         raise AddonError(f"{at.armature.name} shows its rest position: set it to Pose Position (Armature properties)")
     if rigify.is_generated(at.armature):
         return rigify.take_controls(at.armature, at.scene)
-    body = take_bones(at.armature, at.scene)
-    return replace(body, rig_toml=rigify.describe_names(body.names))
+    return take_bones(at.armature, at.scene)
 
 
 def name_joints(at: Scene, bones: Sequence[str]) -> list[str]:
@@ -294,14 +294,9 @@ def _edit(at: Scene, frames: range, words: Sequence[str], generated: np.ndarray,
         folder = Path(temporary)
         with rigify.keep_lengths(at.armature):
             motion, worlds = yield from sample_motion(at.armature, body, at.scene, frames)
-        exchange.write(motion, folder / "given.npz", _place_ends(body), body.movable)
-        names = {"IN": "given.npz", "OUT": "result.npz"}
-        rig = []
-        if body.rig_toml:
-            (folder / "rigify.toml").write_text(body.rig_toml, encoding="utf-8")
-            rig = ["--rig", "rigify.toml"]
-        lines = yield from run_command([*at.command, *(names.get(word, word) for word in words), *rig], folder, label)
-        answer, travelling = exchange.read(folder / "result.npz")
+        exchange.write(motion, folder / _GIVEN, _place_ends(body), body.movable)
+        lines = yield from run_command([*at.command, *words], folder, label)
+        answer, travelling = exchange.read(folder / _RESULT)
         if len(answer.positions) != len(frames):
             raise AddonError(f"mapctl answered with {len(answer.positions)} frames where {len(frames)} were requested")
         moved = to_armature(answer, body, worlds)
@@ -313,7 +308,7 @@ def _edit(at: Scene, frames: range, words: Sequence[str], generated: np.ndarray,
 
 def _shorten(lines: Sequence[str]) -> tuple[str, ...]:
     """Leave the names of temporary files out of mapctl's lines."""
-    return tuple(line.removeprefix("result.npz: ") for line in lines if not line.startswith("wrote "))
+    return tuple(line.removeprefix(f"{_RESULT}: ") for line in lines if not line.startswith("wrote "))
 
 
 def _place_ends(body: Body) -> dict[str, np.ndarray]:
