@@ -58,8 +58,8 @@ def test_rigs_animated_by_ik_keep_hands_and_feet_where_they_were(facts):
 
 
 def test_walk_is_asked_for_as_the_options_say(facts):
-    words = ["follow", "curve.csv", "--rig", "character.npz", "-o", "walk.npz", "--seed", "3"]
-    requests = ["--speed", "1.5", "--seconds", "2.5", "--style", "proud", "--fps", "30"]
+    words = ["follow", "curve.csv", "--rig", "character.npz", "-o", "walk.npz", "--fps", "30"]
+    requests = ["--seed", "3", "--speed", "1.5", "--seconds", "2.5", "--style", "proud"]
     assert facts["words"] == words + requests
 
 

@@ -65,7 +65,7 @@ def test_each_operator_ends_well(played):
 
 def test_the_walk_is_the_one_of_the_command_line(played):
     _, fps, kept, facts, arrays = played
-    file = kept / "follow" / "walk.npz" if fps == 30 else kept / "convert" / "resampled.npz"
+    file = kept / "follow" / "walk.npz"
     wanted = joints(file, facts["joints"]) + np.array([0, HEIGHT, 0])
     assert np.abs(shown(arrays, "walk", facts["joints"], file) - wanted).max() < CLOSE
     assert mapctl.load(file).fps == fps

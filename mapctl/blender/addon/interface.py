@@ -15,7 +15,6 @@ import bpy
 from bpy.props import BoolProperty, FloatProperty, IntProperty, StringProperty
 
 from . import actions, jobs, process
-from .body import measure_fps
 from .process import AddonError, Step
 
 
@@ -225,8 +224,6 @@ class MAPCTL_OT_walk(JobOperator, WalkProperties, bpy.types.Operator):
             words += [name, f"{value:.6g}"] if value > 0 else []
         named = [(name, value.strip()) for name, value in (("--gait", self.gait), ("--style", self.style))]
         words += [word for name, value in named if value for word in (name, value)]
-        if any(value for _, value in named):
-            words += ["--fps", f"{float(measure_fps(at.scene)):.9g}"]
         return jobs.walk_along(at, drawn[0], words)
 
 

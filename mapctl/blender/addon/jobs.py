@@ -224,14 +224,10 @@ def _ask_for_walk(
         folder = Path(name)
         exchange.write(take_rest(body, fps), folder / "character.npz", _place_ends(body), frozenset())
         np.savetxt(folder / "curve.csv", points[:, ::2], fmt="%.6f", delimiter=",", header="x,z", comments="")
-        words = ["follow", "curve.csv", "--rig", "character.npz", "-o", "walk.npz", *options]
+        words = ["follow", "curve.csv", "--rig", "character.npz", "-o", "walk.npz"]
+        words += ["--fps", f"{float(fps):.15g}", *options]
         lines = yield from run_command([*at.command, *words], folder, "walking")
-        walk, travelling = exchange.read(folder / "walk.npz")
-        if walk.fps != fps:  # resampling takes a moment, solving at another rate than the priors' takes long
-            words = ["convert", "walk.npz", "resampled.npz", "--fps", str(fps)]
-            yield from run_command([*at.command, *words], folder, "resampling")
-            walk, travelling = exchange.read(folder / "resampled.npz")
-    return walk, travelling, lines
+        return *exchange.read(folder / "walk.npz"), lines
 
 
 def clean_up(at: Scene, frames: range, *, anchor: bool) -> Job:
