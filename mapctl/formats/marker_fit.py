@@ -61,9 +61,6 @@ _SHANK_RANGE = (0.12, 0.8)  # metres from knee to ankle of bodies in a unit that
 
 
 _ABOVE = kinematics.find_joints_above(_PARENTS)
-_CROSS = torch.zeros(3, 3, 3, dtype=torch.float64)  # of a lever v the matrix M with M d = d x v
-for _a, _b, _c in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-    _CROSS[_a, _b, _c], _CROSS[_a, _c, _b] = 1.0, -1.0
 _MIRROR = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
 
 
@@ -427,7 +424,7 @@ def _solve_poses(
     """Solve for the poses whose markers are nearest, by Levenberg's and Marquardt's method on turns about the world's
     axes: joints are weakly held in their mid poses, strongly within their ranges; outliers count less (Geman and
     McClure 1987)."""
-    frames, ranges, parents = len(positions), _find_ranges(), list(_PARENTS[1:])
+    frames, ranges, parents, one = len(positions), _find_ranges(), list(_PARENTS[1:]), torch.eye(3).double()
     moves, turned = _ABOVE[body.on].double(), torch.arange(3, 3 + 3 * len(_NAMES))
     rest = torch.tensor([_find_rest_sigma(name) for name in _NAMES[1:]]).double() ** -2
     best, damping = (), torch.full((frames,), 1e-2).double()
@@ -443,8 +440,8 @@ def _solve_poses(
         cost = (trust * square / (1 + square / _OUTLIER**2)).sum(dim=1) / _SIGMA**2
         cost = cost + (held * away.square().sum(dim=-1)).sum(dim=(0, 2))
         levers = (points[:, :, None] - joints[:, None]) * moves[..., None]
-        turns = torch.einsum("fmji,iab->fmajb", levers, _CROSS).flatten(3)
-        jacobian = torch.cat([torch.eye(3).double().expand(*missed.shape, 3), turns], dim=3).flatten(1, 2)
+        turns = torch.linalg.cross(one.expand(*levers.shape, 3), levers[..., None, :]).movedim(-1, 2).flatten(3)
+        jacobian = torch.cat([one.expand(*missed.shape, 3), turns], dim=3).flatten(1, 2)
         weighted = jacobian * (trust * _weigh(missed)).repeat_interleave(3, dim=1)[..., None]
         normal, gradient = weighted.mT @ jacobian, (weighted.mT @ missed.flatten(1)[..., None])[..., 0]
         # a turn about axes of the world ahead of the joint's rotation is itself the change of its distance to a target
