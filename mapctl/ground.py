@@ -1,8 +1,7 @@
 """Ground that is not flat: boxes, ramps, stairs and a height field, read from a TOML file."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
@@ -95,8 +94,6 @@ class HeightImage:
     """Middle of the picture, x and z, metres."""
 
 
-PARTS = {"boxes": Box, "ramps": Ramp, "stairs": Stairs, "image": HeightImage}
-"""Parts of a ground by their tables."""
 _SHORTEST = 0.01  # metres of a ramp
 
 
@@ -144,12 +141,7 @@ class Ground:
     @staticmethod
     def read(path: str | PathLike[str]) -> "Ground":
         """Read a TOML file. FileFormatError names file and key."""
-
-        def list_allowed_keys(key: Sequence[int | str]) -> str:
-            kind = PARTS.get(str(key[0]), Ground) if len(key) > 1 else Ground
-            return f"allowed: {', '.join(item.name for item in fields(kind))}"
-
-        return toml.read(path, Ground, what="ground file", unknown=list_allowed_keys).located(path)
+        return toml.read(path, Ground, what="ground file").located(path)
 
     def located(self, path: str | PathLike[str]) -> "Ground":
         """Return the ground with its picture beside the file that it was read from; FileFormatError where a part cannot

@@ -226,7 +226,7 @@ def read_card(path: Path) -> Card:
     try:
         return TypeAdapter(Card).validate_json(path.read_bytes(), strict=True)
     except ValidationError as error:
-        raise CheckpointError(f"{path}: no readable card ({toml.describe_fault(error)})") from error
+        raise CheckpointError(f"{path}: no readable card ({toml.describe_fault(error, Card)})") from error
     except OSError as error:
         raise CheckpointError(f"{path}: no readable card ({error})") from error
 
@@ -293,7 +293,7 @@ class NetworkConfig:
         try:
             found = TypeAdapter(cls).validate_json(json.dumps(free), strict=True)
         except ValidationError as error:
-            raise RequestError(toml.describe_fault(error)) from error
+            raise RequestError(toml.describe_fault(error, cls)) from error
         for name, value in vars(found).items():
             entries = value if isinstance(value, tuple) else (value,)
             if len(entries) > _MAX_ENTRIES or any(isinstance(each, int) and each > _MAX_COUNT for each in entries):

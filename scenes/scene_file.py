@@ -1,7 +1,7 @@
 """Scene files: actors and their curves, cameras and outputs. TOML, checked before any work."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path, PurePath
 from typing import Annotated, Literal
@@ -16,7 +16,7 @@ from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import FileFormatError, MapctlError, RequestError
 from mapctl.formats import toml
 from mapctl.formats.toml import STRICT
-from mapctl.ground import PARTS, Ground
+from mapctl.ground import Ground
 from mapctl.intent.path import SpeedProfile
 from mapctl.intent.shot_keys import ShotKey
 from mapctl.mesh import colours
@@ -197,7 +197,7 @@ class SceneDescription:
 def load(path: str | PathLike[str]) -> tuple[SceneDescription, tuple[Curve, ...]]:
     """Load the scene and each actor's curve in the world, checked. FileFormatError names the file and the key."""
     try:
-        scene = toml.read(path, SceneDescription, what="scene file", unknown=_list_allowed_keys)
+        scene = toml.read(path, SceneDescription, what="scene file")
     except RequestError as error:
         raise FileFormatError(path, str(error)) from error
     named = (replace(a, name=a.name or f"actor{k}") for k, a in enumerate(scene.actors, start=1))
@@ -222,13 +222,6 @@ def transform_curve(actor: Actor, folder: Path) -> Curve:
     ground = slice(0, 3, points.shape[1] - 1)
     points[:, ground] = points[:, ground] @ turn.T + np.array(actor.offset or (0.0, 0.0))
     return curves.from_points(points, closed=curve.closed)
-
-
-def _list_allowed_keys(key: Sequence[int | str]) -> str:
-    known = {"actors": Actor, "camera": CameraSettings, "obstacles": Obstacle, "ground": Ground} if len(key) > 1 else {}
-    inner = {"keys": ShotKey, "footsteps": SceneFootstep, **PARTS}
-    table = next((inner[str(part)] for part in key[1:-1] if part in inner), known.get(str(key[0]), SceneDescription))
-    return f"allowed: {', '.join(item.name for item in fields(table))}"
 
 
 def _check(path: str | PathLike[str], scene: SceneDescription) -> None:

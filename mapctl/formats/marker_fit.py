@@ -9,7 +9,7 @@ import math
 import re
 import tomllib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
@@ -218,13 +218,10 @@ class _MarkerTable(RootModel[dict[str, list[str]]]):
 
 def _read_markers(path: str | PathLike[str]) -> dict[str, list[str]]:
     """Read a user's table of the markers by canonical joint."""
-
-    def unknown(_: Sequence[int | str]) -> str:
-        return f"allowed are canonical joints: {', '.join(_NAMES)}"
-
-    found = toml.read(path, _MarkerTable, what="table of markers", unknown=unknown).root
+    found = toml.read(path, _MarkerTable, what="table of markers").root
     if wrong := [joint for joint in found if joint not in _NAMES]:
-        raise FileFormatError(path, f"{shorten(wrong[0])}: there is no such joint; {unknown(())}")
+        allowed = f"allowed are canonical joints: {', '.join(_NAMES)}"
+        raise FileFormatError(path, f"{shorten(wrong[0])}: there is no such joint; {allowed}")
     return found
 
 

@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
-from difflib import get_close_matches
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 from typing import Annotated, Literal
@@ -240,16 +239,11 @@ def read_keys(path: str | PathLike[str]) -> KeyRequest:
     """Read the keyframe request of a file, the files that it names relative to its folder. FileFormatError names file
     and key."""
 
-    def suggest(key: Sequence[int | str]) -> str:
-        names = [item.name for item in fields(KeyEntry if len(key) > 1 else KeyRequest)]
-        near = get_close_matches(str(key[-1]), names, n=1, cutoff=0)
-        return f"the nearest is {near[0]}; allowed: {', '.join(names)}"
-
     def found(name: str | None) -> str | None:
         return None if name is None else str(Path(path).parent / name)
 
     try:
-        request = toml.read(path, KeyRequest, what="key file", unknown=suggest)
+        request = toml.read(path, KeyRequest, what="key file")
     except RequestError as error:
         raise FileFormatError(path, str(error)) from error
     keys = (replace(key, pose=found(key.pose), drawing=found(key.drawing)) for key in request.key)

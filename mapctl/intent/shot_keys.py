@@ -1,7 +1,7 @@
 """Keys of a shot: what a character does at a time or for a while, as scene and key files give it."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from os import PathLike
 from typing import Annotated, Literal
 
@@ -103,11 +103,7 @@ class ShotKeyFile:
     @staticmethod
     def read(path: str | PathLike[str]) -> "ShotKeyFile":
         """Read a TOML file of keys; FileFormatError names file and key."""
-
-        def list_allowed_keys(key: Sequence[int | str]) -> str:
-            return f"allowed: {', '.join(item.name for item in fields(ShotKey if len(key) > 1 else ShotKeyFile))}"
-
-        found = toml.read(path, ShotKeyFile, what="key file", unknown=list_allowed_keys)
+        found = toml.read(path, ShotKeyFile, what="key file")
         for number, key in enumerate(found.key):
             if key.fault is not None:
                 raise FileFormatError(path, f"key[{number}].{key.fault}")

@@ -131,10 +131,8 @@ def load(path: str | PathLike[str]) -> Robot:
     FileFormatError for a file that is no robot with two legs and arms, RequestError without MuJoCo."""
     path = Path(path)
     model = _compile(path)
-    beside, keys = path.with_suffix(".toml"), "links, speed, soles"
-    stated = _Stated()
-    if beside.exists():
-        stated = toml.read(beside, _Stated, what="robot's table", unknown=lambda _: f"allowed: {keys}")
+    beside = path.with_suffix(".toml")
+    stated = toml.read(beside, _Stated, what="robot's table") if beside.exists() else _Stated()
     return _Tree(path, model).build(stated)
 
 

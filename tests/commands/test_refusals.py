@@ -160,7 +160,7 @@ CASES = {
             "no-seconds": "key[0].seconds: ",
             "nothing": "key[0].reach: ",
             "tail": "key[0].reach.tail: hands and feet are",
-            "misspelt": "key[0].look: there is no such key; allowed: seconds",
+            "misspelt": "key[0].look: there is no such key; the nearest is look_at; allowed: seconds",
             "no-pose": "key[0].pose_frame: this is of a pose",
             "gone": "gone.bvh",
             "tolerance": "has no position for it",

@@ -74,7 +74,7 @@ def test_a_grey_picture_is_a_height_field_along_x_and_z(tmp_path):
 REFUSED = {
     "unknown key": (
         "[[boxes]]\ncentre = [0, 0]\nsize = [1, 1]\nheight = 1\nhigh = 1",
-        "boxes[0].high: there is no such key; allowed",
+        "boxes[0].high: there is no such key; the nearest is height; allowed",
     ),
     "negative size": ("[[boxes]]\ncentre = [0, 0]\nsize = [1, -1]\nheight = 1", "boxes[0].size[1]: "),
     "ramp without length": ("[[ramps]]\nstart = [0, 1]\nend = [0, 1]\nheights = [0, 1]", "ramps[0].end: a ramp is"),
