@@ -12,7 +12,7 @@ help:
 	@echo "make demo      a character walks along curves: motion, film and report in demo-out/"
 	@echo "make test      the quick tests"
 	@echo "make test-all  every test"
-	@echo "make bench     cost of the solver on this machine"
+	@echo "make bench     cost of walks on this machine"
 	@echo "make check     ruff, basedpyright, import-linter"
 	@echo "make docs      the site in docs/_build/html: pages, gallery, reference"
 	@echo "make dist      sdist and wheel in dist/, and their sizes"

@@ -29,7 +29,7 @@ COMMANDS = {
     "mcp": ("ServeTools", "Serve info, shot, denoise, measure and contact sheet to an assistant, over MCP."),
     "compile": ("CompileKernels", "Compile the kernels and keep them on disk, so that the first motion does not wait."),
     "blender-addon": ("BlenderAddon", "Write the add-on for Blender 4.2 and later."),
-    "bench": ("Bench", "Cost on this machine: energy and gradient of a window, following a curve, steering."),
+    "bench": ("Bench", "Cost on this machine: following a curve, and steering."),
 }
 """Class of options and summary of each command, by the name the user types, in the order of the help."""
 SUBCOMMANDS: dict[str, Mapping[str, type]] = {"train": KINDS}

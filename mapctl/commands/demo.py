@@ -1,24 +1,21 @@
 """`mapctl demo`: path following on the bundled prior, from nothing to a film."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 
-import priors
-from controllers.common.character import Character
-from mapctl import curves, report
+import scenes
+from mapctl.commands.run import RunScene, run_scene
 from mapctl.commands.shared import options, outputs
-from mapctl.commands.shared.command import INTERRUPTED, ModelCommand
-from mapctl.commands.shared.shots import plan_shot, play_shot
+from mapctl.commands.shared.command import ModelCommand
 from mapctl.errors import RequestError
-from scenes.cameras import CameraSettings
-from scenes.film import film
-from scenes.scene_file import Actor
+from scenes.scene_file import load
 
 
 @dataclass(frozen=True)
 class Demo(ModelCommand):
-    """A character walks a figure-8 on the bundled prior: motion, film, contact sheet and report.
+    """A character walks a figure-8 on the bundled prior: motion, film, contact sheet and report, as of the ready scene
+    `figure_eight` of `mapctl run`.
 
     Where the extra `render` is not installed, there is no film, and the sheet shows stick figures.
     """
@@ -31,42 +28,24 @@ class Demo(ModelCommand):
     quiet: options.Quiet = False
 
 
-CURVE, SPEED = "figure8:2", "1.2"
-_SIZE = (960, 540)
+SCENE, SIZE = "figure_eight", (960, 540)
 
 
 def run(command: Demo) -> int:
-    """Walk, write, film, report. Without OpenGL the film shows stick figures and a note on what is missing; what needs
-    packages that are not installed is left out, with a note.
-
-    Ctrl-C ends the walk; the motion so far is written, without a film.
-    """
+    """Play the scene, but for outputs that need packages that are not installed: a note names them."""
     options.check_seed(command.seed)
-    outputs.check_folder(command.out)
+    path = scenes.find_scene(SCENE)
+    scene, curves = load(path)
     missing = {}
-    for ending, packages in (("mp4", ("av", "PIL")), ("png", ("PIL",))):
+    for ending, packages in ((".mp4", ("av", "PIL")), (".png", ("PIL",))):
         try:
             outputs.require_render(*packages, "matplotlib" if find_spec("pyrender") is None else "pyrender")
         except RequestError as error:
             missing[ending] = str(error)
-    actor, curve = Actor(curve=CURVE, speed=SPEED, seed=command.seed), curves.read(CURVE)
-    plan = plan_shot(
-        actor, curve, priors.load(command.prior), character=Character(), folder=Path(), options=options.ReadOptions()
-    )
-    with outputs.show_progress("walking", quiet=command.quiet) as progress:
-        done = play_shot(plan, progress=progress)
-    with outputs.make_folder(command.out) as folder:
-        pictures = [e for e in ("mp4", "png") if e not in missing and not done.interrupted]
-        files = {ending: folder / f"figure8.{ending}" for ending in ("bvh", "json", *pictures)}
-        outputs.save_motion(done.solution.motion, files["bvh"])
-        request = options.describe_request("demo", command) | {"curve": CURVE, "speed": SPEED}
-        report.write_report(done.report(request), files["json"])
-        if films := [files[ending] for ending in ("mp4", "png") if ending in files]:
-            with outputs.show_progress("filming", quiet=command.quiet) as progress:
-                actors = [(done.solution.motion, done.request.curve)]
-                film(actors, films, camera=CameraSettings("fixed"), size=_SIZE, progress=progress)
-    if not command.quiet:
-        print("\n".join([*done.summary(), f"wrote     {', '.join(map(str, files.values()))}"]))
-        if missing:
-            print(f"missing   {', '.join(f'.{ending}' for ending in missing)}: {next(iter(missing.values()))}")
-    return INTERRUPTED if done.interrupted else 0
+    actors = tuple(replace(actor, seed=command.seed) for actor in scene.actors)
+    kept = tuple(f"figure8{ending}" for ending in (".bvh", ".json", ".mp4", ".png") if ending not in missing)
+    scene = replace(scene, actors=actors, outputs=kept, prior=command.prior, size=SIZE)
+    status = run_scene(RunScene(str(path), command.out, quiet=command.quiet), path, scene, curves)
+    if missing and not command.quiet:
+        print(f"missing   {', '.join(missing)}: {next(iter(missing.values()))}")
+    return status

@@ -58,7 +58,7 @@ def run(command: RunScene) -> int:
     options.check_variations(command.variations)
     takes = [scene] if command.variations == 1 else [_number(scene, take) for take in range(command.variations)]
     with priors.use_weights(command.weights or scene.weights):
-        return max(_run_scene(command, path, take, curves) for take in takes)
+        return max(run_scene(command, path, take, curves) for take in takes)
 
 
 def _number(scene: SceneDescription, take: int) -> SceneDescription:
@@ -67,7 +67,9 @@ def _number(scene: SceneDescription, take: int) -> SceneDescription:
     return replace(scene, actors=actors, outputs=names)
 
 
-def _run_scene(command: RunScene, path: Path, scene: SceneDescription, curves: Sequence[Curve]) -> int:
+def run_scene(command: RunScene, path: Path, scene: SceneDescription, curves: Sequence[Curve]) -> int:
+    """Plan and solve every actor of a scene from a file, along its curve, and write the outputs; return the exit
+    status."""
     read_body, read_drawn = functools.cache(inputs.read_character), functools.cache(inputs.read_drawn_character)
     prior, plans = priors.load(scene.prior), list[ShotPlan]()
     for actor, curve in zip(scene.actors, curves, strict=True):

@@ -127,10 +127,12 @@ def test_run_plays_a_scene(prior, tmp_path, monkeypatch):
 
 def test_demo_leaves_four_files(prior, tmp_path, monkeypatch):
     monkeypatch.setenv("MAPCTL_RENDERER", "stick")
-    monkeypatch.setattr("mapctl.commands.demo.CURVE", "line:0.5")
-    monkeypatch.setattr("mapctl.commands.demo._SIZE", (96, 64))
+    monkeypatch.setattr("mapctl.commands.demo.SCENE", str(tmp_path / "short.toml"))
+    monkeypatch.setattr("mapctl.commands.demo.SIZE", (96, 64))
+    (tmp_path / "short.toml").write_text('outputs = ["short.bvh"]\n[[actors]]\ncurve = "line:0.5"\n')
     assert run("demo", "-o", tmp_path / "demo", "--prior", prior, "--quiet") == 0
-    assert {path.suffix for path in (tmp_path / "demo").iterdir()} == {".bvh", ".json", ".mp4", ".png"}
+    written = {path.name for path in (tmp_path / "demo").iterdir()}
+    assert written == {"figure8.bvh", "figure8.json", "figure8.mp4", "figure8.png"}
 
 
 def test_info_names_what_is_here(prior, capsys):

@@ -119,7 +119,7 @@ def test_a_film_is_written_beside_the_motion(here, name):
 
 @pytest.mark.slow
 def test_bench_measures_cost(prior, monkeypatch, capsys):
-    monkeypatch.setattr(bench, "SIZES", bench.Sizes(repeats=1, candidates=(1,), seconds=(1.0,), steps=3))
+    monkeypatch.setattr(bench, "SECONDS", (1.0,))
     assert run("bench", "--prior", prior, "--live", prior, "--json") == 0
-    evaluation, follow, steer = json.loads(capsys.readouterr().out)["rows"]
-    assert min(evaluation["times_faster"], follow["ms_per_frame"], steer["ms_per_frame"]) > 0
+    follow, steer = json.loads(capsys.readouterr().out)["rows"]
+    assert min(follow["ms_per_frame"], steer["ms_per_frame"]) > 0
