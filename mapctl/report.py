@@ -12,10 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mapctl import metrics
-from mapctl.curves.curve import Curve
 from mapctl.formats.atomic import write_text
-from mapctl.motion import Motion
 from mapctl.problem.solution import Solution, WindowRecord
 from mapctl.version import __version__
 
@@ -52,7 +49,7 @@ def build_report(
         "motion": {"frames": motion.num_frames, "fps": float(motion.fps), "seconds": motion.seconds},
         "ledger": solution.ledger.summary(),
         "measures": dict(measures),
-        "mocap": None if prior is None else reference_measures(prior.get("quality", {})),
+        "mocap": None if prior is None else prior.get("quality", {}).get("mocap", {}),
         "timing": timing or summarise_timing(solution.windows, seconds=solution.seconds),
         "seconds": solution.seconds,
     }
@@ -67,17 +64,6 @@ def write_report(report: Mapping[str, Any], path: str | PathLike[str]) -> None:
 def to_json(values: Any) -> str:
     """Format indented JSON that every parser reads: NaN and infinities are null."""
     return json.dumps(_replace_non_finite(values), indent=1, allow_nan=False) + "\n"
-
-
-def measure_path(motion: Motion, curve: Curve, *, wanted_m: float, joint: str | None = None) -> dict[str, float]:
-    """Measure a motion that was to go `wanted_m` metres along the curve, at whatever speed."""
-    seconds = (motion.num_frames - 1) / float(motion.fps)
-    return metrics.measure(motion, curve, speed=wanted_m / seconds, joint=joint)
-
-
-def reference_measures(quality: Mapping[str, Any]) -> dict[str, Any]:
-    """Return measures of held-out mocap: mean, p2, p98; empty where the prior's card has no table."""
-    return dict(quality.get("mocap", {}))
 
 
 def summarise_timing(windows: Sequence[WindowRecord], *, seconds: float) -> dict[str, float | int | None]:

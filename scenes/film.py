@@ -24,7 +24,7 @@ from mapctl.mesh.primitives import Array, Surface
 from mapctl.motion import Motion
 from mapctl.retarget.rigs import Rig
 from scenes.cameras import CameraSettings
-from scenes.renderers import STICK_FIGURES, Painter, RendererName, select_painter
+from scenes.renderers import STICK_FIGURES, Painter, select_painter
 from scenes.stage import Shot, Stage
 
 Write = Callable[[Array], None]
@@ -108,8 +108,8 @@ _GAP = 0.008
 """Margin between pictures, as a share of the width."""
 _GHOST_STRIDE = 1.0
 """Distance between ghosts, about, metres."""
-_STRIP_STILLS, _STRIP_SHAPE = 9, 1.3
-"""Stills of a strip, and the height of each over its width."""
+_STRIP_WIDTH, _STRIP_STILLS, _STRIP_SHAPE = 1280, 9, 1.3
+"""Width of a strip, pixels, its stills, and the height of each over its width."""
 _MAX_GHOSTS = 16
 """Number of ghosts of all actors together, but at least four each."""
 
@@ -191,7 +191,6 @@ def film(
     camera: CameraSettings | None = None,
     size: tuple[int, int] = (1280, 720),
     fps: Fraction | float | None = None,
-    renderer: RendererName | None = None,
     props: Sequence[Surface] = (),
     ground: Ground | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -203,11 +202,11 @@ def film(
     path or several, each ending in .mp4, .gif, .webp or .png (a contact sheet: ghosts along the trajectory over a row
     of stills). Each frame of the motions is one frame of the film unless `fps` resamples them. `size` is the width and
     height in pixels (MP4 rounds up to even). `props` are what stands around (`scenes.overlays`), `ground` what
-    they walk on if it is not flat. `progress` is called with frames done and all frames. `renderer` is that of
-    `scenes.renderers.select_painter`. RequestError for endings, sizes and paths that cannot be.
+    they walk on if it is not flat. `progress` is called with frames done and all frames. RequestError for endings,
+    sizes and paths that cannot be.
     """
     paths = check_outputs([out] if isinstance(out, str | PathLike) else out, size)
-    shots, brush, camera = [Shot(*actor) for actor in actors], select_painter(renderer), camera or CameraSettings()
+    shots, brush, camera = [Shot(*actor) for actor in actors], select_painter(), camera or CameraSettings()
     stage = Stage(shots, fps, props, ground)
     if brush.name == STICK_FIGURES and any(shot.drawn is not None for shot in shots):
         _log.warning("stick figures show no mesh: characters are drawn by their bones")
@@ -234,16 +233,9 @@ def film_side_by_side(
     film([(after, None), (beside, None, "#999999")], path, progress=progress)
 
 
-def draw_strips_to(
-    motions: Sequence[tuple[str, Motion]], out: PathOrText, *, size: tuple[int, int] = (1280, 720)
-) -> None:
-    """Draw motions below each other, a row of stills at the same times of each and under its name, to a .png; `size` is
-    its width, pixels, and a height that is passed over: rows are as high as they come. RequestError for other
-    endings."""
-    (path,) = check_outputs([out], size)
-    if path.suffix.lower() != ".png":
-        raise RequestError(f"motions below each other are a .png, not {path}")
-    brush, camera, width = select_painter(None), CameraSettings("follow"), size[0]
+def draw_strips_to(motions: Sequence[tuple[str, Motion]], path: Path) -> None:
+    """Draw motions below each other, a row of stills at the same times of each and under its name, to a .png."""
+    brush, camera, width = select_painter(), CameraSettings("follow"), _STRIP_WIDTH
     rows, gap = [], np.full((_measure_gap(width), width, 3), 255, np.uint8)
     for name, motion in motions:
         stage, title = Stage([Shot(motion)]), name.replace(" and ", "\n")

@@ -204,7 +204,6 @@ def _open_graphics() -> tuple[ModuleType, Any]:
         raise NoGraphicsError(f"no OpenGL without a window ({reason})") from error
 
 
-RendererName = Literal["auto", "egl", "stick"]
 RENDERER_VARIABLE = "MAPCTL_RENDERER"
 """Environment variable with the renderer where none is requested."""
 
@@ -212,7 +211,7 @@ _ADVICE = "For shaded bodies: pip install 'mapctl[render]', and on Debian apt-ge
 _log = logging.getLogger("mapctl.scenes")
 
 
-def select_painter(name: RendererName | None = None) -> "Painter":
+def select_painter(name: Literal["auto", "egl", "stick"] | None = None) -> "Painter":
     """Select the painter of a name; None takes the one in MAPCTL_RENDERER, else `auto`.
 
     `auto` falls back to stick figures and logs one line on what is missing; `egl` raises NoGraphicsError.

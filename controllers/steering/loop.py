@@ -29,6 +29,7 @@ from mapctl.metrics.travel import list_misses, measure_arrivals, measure_command
 from mapctl.motion import Motion
 from mapctl.problem.solution import Ledger
 from mapctl.rotations import make_sign_continuous
+from mapctl.runtime.live_protocol import FrameChunk
 
 _MARGIN, _MOST_MARGIN = 0.015, 0.05  # seconds before frames are due at which a step is to end, for the display
 _MARGIN_USED, _MARGIN_RISE, _MARGIN_FALL = 0.75, 1.5, 0.997  # found within a second, and forgotten within a minute
@@ -188,6 +189,27 @@ class Playback:
             raise RequestError("nothing was shown")
         frame = PRIOR_FPS * read_number(seconds, "the second of a pose") - self._first
         return self._whole.sample(torch.tensor([frame], dtype=torch.float64))
+
+
+def make_chunk(
+    frames: SteerFrames, due: float, seconds: float, *, spare: float = 0.0, notes: tuple[str, ...] = ()
+) -> FrameChunk:
+    """Return the frames of a step as plain arrays, to send to another process; the other values as of FrameChunk."""
+    return FrameChunk(
+        due,
+        seconds,
+        frames.motion.root_position.numpy(),
+        frames.motion.local_quat_xyzw.numpy(),
+        frames.contacts.numpy(),
+        frames.forecast.numpy(),
+        frames.steering_targets[-1].velocity,
+        frames.steering_targets[-1].facing,
+        spare,
+        frames.seconds,
+        frames.root_velocity.numpy(),
+        frames.trajectory.numpy(),
+        notes,
+    )
 
 
 def find_second_zero(clock: StreamClock, state: SteerState) -> float:

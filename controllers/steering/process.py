@@ -8,6 +8,7 @@ exact.
 
 import itertools
 import math
+import multiprocessing
 import os
 import queue
 import threading
@@ -25,7 +26,7 @@ import torch
 
 from controllers.steering import steer
 from controllers.steering.arrival import Arriver
-from controllers.steering.loop import WallClock, find_second_zero, iterate_steps
+from controllers.steering.loop import WallClock, find_second_zero, iterate_steps, make_chunk
 from controllers.steering.steer import SteerFrames, SteerSettings
 from mapctl import curves
 from mapctl.curves.curve import Curve
@@ -34,7 +35,7 @@ from mapctl.features import PRIOR_FPS
 from mapctl.intent.steering import Arrival, Command, SteeringLimits
 from mapctl.protocols import Density
 from mapctl.runtime.live_protocol import FrameChunk, LiveCharacter
-from mapctl.runtime.processes import open_pipe, preload, send_queued, spawn
+from mapctl.runtime.processes import preload, send_queued, spawn
 from mapctl.skeleton import CANONICAL, Skeleton
 
 _ARRIVAL_DISTANCE = 0.15  # metres before the end of a path at which the character stops
@@ -207,21 +208,7 @@ class ProcessClock(WallClock):
             self._notes.append(frames.refusal.reason)
         at = self._began + due + self._behind
         spare = at - time.perf_counter() - self._held
-        chunk = FrameChunk(
-            at,
-            due,
-            frames.motion.root_position.numpy(),
-            frames.motion.local_quat_xyzw.numpy(),
-            frames.contacts.numpy(),
-            frames.forecast.numpy(),
-            frames.steering_targets[-1].velocity,
-            frames.steering_targets[-1].facing,
-            spare,
-            frames.seconds,
-            frames.root_velocity.numpy(),
-            frames.trajectory.numpy(),
-            tuple(self._notes),
-        )
+        chunk = make_chunk(frames, at, due, spare=spare, notes=tuple(self._notes))
         self._connection.send(("frames", chunk))
         self._held = 0.0
         self._notes.clear()
@@ -402,7 +389,7 @@ class CharacterProcess(LiveCharacter):
         self._delivered: deque[FrameChunk] = deque(maxlen=_MAX_QUEUED_STEPS)
         self._orders: queue.SimpleQueue[tuple[Any, ...] | None] = queue.SimpleQueue()
         self._ready, self._failed = threading.Event(), ""
-        self._ours, theirs = open_pipe()
+        self._ours, theirs = multiprocessing.Pipe()
         with theirs:
             self._process = spawn(run_worker, theirs, self._request)
         # A full pipe would block the character, so it is emptied whether or not the caller polls; and a character that

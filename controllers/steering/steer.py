@@ -75,7 +75,8 @@ KEPT_FRAMES = 11
 """Last frames whose features are kept: an arrival continues from them."""
 _JUDGED_FRAMES = 60  # that are kept for terms that look back
 _PAST_TARGET_FRAMES = 60  # past targets that are kept: more than the root velocity term looks back on
-_REST_FRAMES = 8  # over which a body at rest hardly goes
+_SIGMA_FACING = 0.15  # radians of the hips' heading
+_REST_FRAMES, _STANDING = 8, 0.25  # over which a body at rest goes at less than so many m/s
 _WIDER = 2.0  # times that the prior is along planned steps, which it takes for less likely than they are
 _ALONG_STEPS = 2  # evaluations along planned steps, which obey the command already
 _ENOUGH = 1e-2  # share of the energy: a search ends where an iteration wins less
@@ -88,7 +89,7 @@ _LONGEST_REST = 0.02  # seconds: a rest beyond it was interrupted by another pro
 
 @dataclass(frozen=True)
 class SteerSettings:
-    """Sigmas, window lengths and budget."""
+    """Window lengths, budget and limits."""
 
     horizon: int = 24
     """Frames of a window, the look-ahead included."""
@@ -101,16 +102,6 @@ class SteerSettings:
     than `evaluations`."""
     limits: SteeringLimits = field(default_factory=SteeringLimits)
     """How fast a steering target may change."""
-    sigma_speed: float = RootVelocity.sigma_speed
-    """Sigma of the speed along the target velocity, m/s."""
-    sigma_direction: float = RootVelocity.sigma_direction
-    """Sigma of the velocity's direction, radians."""
-    sigma_facing: float = 0.15
-    """Sigma of the hips' heading, radians."""
-    sigma_step: float = StepLength.sigma
-    """Sigma of a requested step length, metres."""
-    standing: float = 0.25
-    """Mean speed of the hips over a quarter of a second, m/s, below which a body is at rest."""
     footing: FootContact = field(default_factory=FootContact)
     """Contact term."""
     noise: LatentPrior = field(default_factory=LatentPrior)
@@ -121,9 +112,7 @@ class SteerSettings:
 
     def scaled_to(self, character: Character) -> "SteerSettings":
         """Return the settings for a character of this size, in metres of the prior's size."""
-        names = "sigma_speed", "sigma_step", "standing"
-        sigmas = {name: getattr(self, name) / character.scale for name in names}
-        return replace(self, limits=character.limits(self.limits), footing=character.footing(self.footing), **sigmas)
+        return replace(self, limits=character.limits(self.limits), footing=character.footing(self.footing))
 
 
 @dataclass(frozen=True)
@@ -488,7 +477,7 @@ def _find_stand(state: SteerState, command: Command) -> Stand | None:
 def _is_at_rest(state: SteerState) -> bool:
     """Return whether the body hardly went in the last quarter of a second."""
     known = len(state.committed.joints_world) > _REST_FRAMES
-    return known and float(_recent_velocity(state).norm()) < state.settings.standing
+    return known and float(_recent_velocity(state).norm()) < _STANDING / state.character.scale
 
 
 def _find_pose(state: SteerState) -> Motion:
@@ -542,17 +531,16 @@ def _recent_velocity(state: SteerState) -> Float[Tensor, "2"]:
 def _build_steering_terms(
     state: SteerState, targets: Sequence[SteeringTarget], step_length: float | None
 ) -> Sequence[Term]:
-    settings = state.settings
+    scale = state.character.scale
     velocity = RootVelocity(
         torch.tensor([target.velocity for target in targets]),
         state.past_targets,
         facing=torch.tensor([target.facing for target in targets]),
-        sigma_speed=settings.sigma_speed,
-        sigma_direction=settings.sigma_direction,
-        sigma_facing=settings.sigma_facing,
+        sigma_speed=RootVelocity.sigma_speed / scale,
+        sigma_facing=_SIGMA_FACING,
     )
-    terms = velocity, settings.footing
-    return (*terms, StepLength(step_length, sigma=settings.sigma_step)) if step_length else terms
+    terms = velocity, state.settings.footing
+    return (*terms, StepLength(step_length, sigma=StepLength.sigma / scale)) if step_length else terms
 
 
 def _draw_noise(state: SteerState) -> Float[Tensor, "frames continuous"]:

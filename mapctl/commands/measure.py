@@ -142,7 +142,7 @@ class _ClipSet:
             for number, path in enumerate(paths, start=1):
                 try:
                     motion, notes = _make_comparable(inputs.read_motion(path, rig), path, rig)
-                    windows = [realism.cut_windows(realism.canonical_positions(motion))] if with_windows else []
+                    windows = [realism.cut_windows(motion)] if with_windows else []
                     found.measures.append(metrics.measure(motion))
                     found.windows.extend(windows)
                     found.notes.extend(notes)
@@ -182,7 +182,7 @@ def _measure_folders(command: Measure) -> dict[str, Any]:
     reference = _ClipSet.read(command.reference, with_windows=True)
     generator = torch.Generator().manual_seed(0)
     with outputs.show_progress("comparing") as progress:
-        compared = realism.measure_window_realism(
+        compared = realism.measure_realism(
             ours.windows, reference.windows, generator=generator, settings=SETTINGS, progress=progress
         )
     return values | {
@@ -274,9 +274,7 @@ def _print_realism(realism: Mapping[str, Any]) -> None:
 def _read_mocap_values() -> Mapping[str, Any]:
     """Read mocap's values from the card of the bundled prior; none where there is none."""
     try:
-        return report.reference_measures(
-            checkpoints.read_card(checkpoints.locate("locomotion").with_suffix(".json")).quality
-        )
+        return checkpoints.read_card(checkpoints.locate("locomotion").with_suffix(".json")).quality.get("mocap", {})
     except CheckpointError:
         return {}
 

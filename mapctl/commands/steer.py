@@ -23,6 +23,7 @@ from controllers.steering.loop import (
     WallClock,
     drive,
     find_second_zero,
+    make_chunk,
     summarise_step_timing,
 )
 from controllers.steering.steer import SteerFrames
@@ -228,13 +229,9 @@ def _stream_to(stream: "PoseStream", clock: WallClock, frames: int, zero: float)
     """Build the display that has a script's frames sent when they are due; `zero` is the clock's time at second 0."""
 
     def show(new: SteerFrames, due: float) -> None:
-        left = frames - round(due * float(new.motion.fps))
-        if left > 0:
-            motion, trajectory = new.motion, new.trajectory.numpy()
-            parts = motion.root_position, motion.local_quat_xyzw, new.contacts, new.root_velocity
-            root, quats, contacts, velocity = (part[:left].numpy() for part in parts)
-            guidance = stream.guide(root, quats, contacts, velocity, trajectory)
-            stream.put(0, clock.perf_counter_at(zero + due), due, root, quats, guidance)
+        chunk, left = make_chunk(new, clock.perf_counter_at(zero + due), due), frames - round(due * PRIOR_FPS)
+        names = ("root", "quats", "contacts", "root_velocity")
+        stream.put(0, replace(chunk, **{name: getattr(chunk, name)[:left] for name in names}))
 
     return show
 

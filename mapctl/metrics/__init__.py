@@ -46,9 +46,7 @@ _CM = 100.0
 _HEELS = "heel_contact_speed_cm_s", "heel_planted_share", "heel_slide_max_cm", "foot_turn_deg_s"
 
 
-def measure(
-    motion: Motion, curve: Curve | None = None, *, speed: float | None = None, joint: str | None = None
-) -> dict[str, float]:
+def measure(motion: Motion, curve: Curve | None = None, *, speed: float | None = None) -> dict[str, float]:
     """Measure one motion, by name of the measure.
 
     Always: `skate_cm_s`, `skate_ratio`, `contact_speed_cm_s`, `planted_share`, `penetration_cm`, `float_cm`,
@@ -58,8 +56,8 @@ def measure(
     `turn_rate_deg_s`, `hips_height_m`, `pose_variation_cm`, and `sway_cm`: from the straight line between the walk's
     ends, or from the curve. With a curve
     also `path_error_{mean,p95,max}_cm`, `path_error_low_passed_{mean,p95,max}_cm` and `travelled_m`; with the wanted
-    `speed` (m/s) `wanted_m` and `progress_ratio` too. `joint` names the one that follows the curve, else the hips do.
-    MapctlError for rigs whose hips, legs or feet are not found, unknown joints and motions of one frame.
+    `speed` (m/s) `wanted_m` and `progress_ratio` too; the hips follow it. MapctlError for rigs whose hips, legs or feet
+    are not found, and motions of one frame.
     """
     if motion.num_frames < 2:
         raise RequestError("measures need a motion of at least 2 frames")
@@ -79,8 +77,7 @@ def measure(
         share = ((apart @ along) / along.square().sum().clamp_min(1e-12)).clamp(0, 1)
         side = torch.sign(along[1] * apart[:, 0] - along[0] * apart[:, 1])
         return measures | {"sway_cm": sway((apart - share[:, None] * along).norm(dim=-1) * side, fps) * _CM}
-    follower = hips if joint is None else motion.skeleton.index(joint)
-    return measures | _measure_path(positions[:, follower], curve, speed, fps)
+    return measures | _measure_path(positions[:, hips], curve, speed, fps)
 
 
 def _measure_feet(toe_positions: Float[Tensor, "frames 2 3"], fps: float) -> dict[str, float]:

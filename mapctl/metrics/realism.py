@@ -29,6 +29,10 @@ _LEAST_STD = 1e-3  # floor of a standard deviation, m or m/s, so that joints tha
 
 WINDOW_FRAMES, _WINDOW_STEP = 30, 10
 """Frames a window, at 30 a second; one more is needed before it for the velocities."""
+_BATCH = 64  # windows a step, half from each set
+_WIDTH, _DROPOUT = 48, 0.3  # channels of each convolution, and share of its activations that are dropped in training
+_LEARNING_RATE, _WEIGHT_DECAY = 1e-3, 1e-2  # of AdamW
+_DIMS = 32  # principal components of mocap's windows in which the Frechet distance is taken
 
 
 @dataclass(frozen=True)
@@ -39,18 +43,6 @@ class RealismSettings:
     """Number of parts of the clips; each is held out once while a network learns on the others."""
     steps: int = 400
     """Number of optimiser steps of each network, whatever the sets' size. More make a stricter judge."""
-    batch: int = 64
-    """Number of windows a step, half from each set."""
-    width: int = 48
-    """Number of channels of each convolution."""
-    dropout: float = 0.3
-    """Share of activations that are dropped in training."""
-    learning_rate: float = 1e-3
-    """Learning rate of AdamW, a number without unit."""
-    weight_decay: float = 1e-2
-    """Weight decay of AdamW, a number without unit."""
-    dims: int = 32
-    """Number of principal components of mocap's windows in which the Frechet distance is taken."""
 
     @property
     def min_clips(self) -> int:
@@ -77,25 +69,6 @@ class Realism:
 
 
 def measure_realism(
-    generated: Sequence[Motion],
-    mocap: Sequence[Motion],
-    *,
-    generator: torch.Generator,
-    settings: RealismSettings = RealismSettings(),
-    progress: Progress | None = None,
-) -> Realism:
-    """Compare generated clips with mocap, both of any known rig and frame rate; half a minute on one core.
-
-    The floor's halves are every other clip of one shuffle that the generator draws: neither style nor length is
-    balanced between them, so a small set's floor scatters around 0.5 from seed to seed; it depends on mocap alone.
-    Sets should hold the same kinds of motion, or the network learns to separate the kinds. RequestError for fewer
-    than 8 clips in a set, clips shorter than a window (31 frames at 30 fps), and rigs that are not known.
-    """
-    sets = [[cut_windows(canonical_positions(clip)) for clip in clips] for clips in (generated, mocap)]
-    return measure_window_realism(*sets, generator=generator, settings=settings, progress=progress)
-
-
-def measure_window_realism(
     generated: Sequence[Tensor],
     mocap: Sequence[Tensor],
     *,
@@ -103,7 +76,13 @@ def measure_window_realism(
     settings: RealismSettings = RealismSettings(),
     progress: Progress | None = None,
 ) -> Realism:
-    """Measure realism from `cut_windows` of each clip, (windows, frames, channels); RequestError for too few clips."""
+    """Compare clips with mocap, `cut_windows` of each, (windows, frames, channels); half a minute on one core.
+
+    The floor's halves are every other clip of one shuffle that the generator draws: neither style nor length is
+    balanced between them, so a small set's floor scatters around 0.5 from seed to seed; it depends on mocap alone.
+    Sets should hold the same kinds of motion, or the network learns to separate the kinds. RequestError for fewer
+    than 8 clips in a set.
+    """
     if min(len(generated), len(mocap)) < settings.min_clips:
         counts = f"got {len(generated)} and {len(mocap)}"
         raise RequestError(f"realism needs at least {settings.min_clips} clips of each, generated and mocap; {counts}")
@@ -122,7 +101,7 @@ def measure_window_realism(
         compute_held_out_accuracy(*sets, generator=drawn, settings=settings, tick=tick)
         for sets, drawn in ((halves, shuffled), ((generated, mocap), ours))
     )
-    basis = Basis.of(torch.cat(list(mocap)), settings.dims)
+    basis = Basis.of(torch.cat(list(mocap)), _DIMS)
     points = [basis.project(torch.cat(list(clips))) for clips in (generated, mocap, *halves)]
     frechet, floor_frechet = frechet_distance(*points[:2]), frechet_distance(*points[2:])
     return Realism(accuracy, floor, frechet, floor_frechet, len(points[0]), len(points[1]))
@@ -148,13 +127,14 @@ def transform_to_ground_frame(
     return rotations.rotate_about_y(positions - rotations.lift_ground(ground_xz).unsqueeze(-2), -angle.unsqueeze(-1))
 
 
-def cut_windows(positions: Float[Tensor, "clip_frames joints 3"]) -> Float[Tensor, "windows frames channels"]:
-    """Cut one clip into windows, float32: joint positions (m), then velocities (m/s) from the frame before each.
+def cut_windows(motion: Motion) -> Float[Tensor, "windows frames channels"]:
+    """Cut one clip of any known rig and rate into windows, float32: canonical joint positions (m) at 30 frames a
+    second, then velocities (m/s) from the frame before each.
 
-    `positions` are those of `canonical_positions`. A window is relative to the hips' ground projection and facing in
-    the frame before its first. RequestError for a clip shorter than one window.
+    A window is relative to the hips' ground projection and facing in the frame before its first. RequestError for a
+    clip shorter than one window, and for rigs that are not known.
     """
-    needed = WINDOW_FRAMES + 1
+    positions, needed = canonical_positions(motion), WINDOW_FRAMES + 1
     if len(positions) < needed:
         raise RequestError(f"{len(positions)} frames at {PRIOR_FPS} fps; a window needs at least {needed}")
     starts = torch.arange(0, len(positions) - WINDOW_FRAMES, _WINDOW_STEP)
@@ -255,12 +235,12 @@ def _train_network(
     layers: list[nn.Module] = []
     channels = windows.shape[-1]
     for stride in (1, 2, 2):
-        layers += [nn.Conv1d(channels, settings.width, 5, stride, padding=2), nn.LeakyReLU(0.2)]
-        layers.append(nn.Dropout(settings.dropout))
-        channels = settings.width
+        layers += [nn.Conv1d(channels, _WIDTH, 5, stride, padding=2), nn.LeakyReLU(0.2)]
+        layers.append(nn.Dropout(_DROPOUT))
+        channels = _WIDTH
     network = nn.Sequential(*layers, nn.AdaptiveAvgPool1d(1), nn.Flatten(), nn.Linear(channels, 1), nn.Flatten(0))
-    optimiser = torch.optim.AdamW(network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay)
-    half = settings.batch // 2
+    optimiser = torch.optim.AdamW(network.parameters(), lr=_LEARNING_RATE, weight_decay=_WEIGHT_DECAY)
+    half = _BATCH // 2
     target = torch.cat([torch.ones(half), torch.zeros(half)])
 
     def classify(part: Tensor) -> Tensor:

@@ -27,12 +27,6 @@ def spawn(target: Callable[..., None], *arguments: Any) -> BaseProcess:
     return process
 
 
-def open_pipe(*, duplex: bool = True) -> tuple[Connection, Connection]:
-    """Open a pipe and return its ends: the first reads and the second writes, or `duplex` both do both."""
-    ends: Any = multiprocessing.Pipe(duplex)  # its type differs by system
-    return ends
-
-
 def send_queued(connection: Connection, messages: "queue.SimpleQueue[Any]") -> None:
     """Send queued messages, until None or the end of the process at the other end: for a thread, which may wait."""
     with suppress(OSError):

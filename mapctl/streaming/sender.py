@@ -24,6 +24,7 @@ from pythonosc.osc_message_builder import OscMessageBuilder
 
 from mapctl import kinematics, rotations
 from mapctl.features import PRIOR_FPS
+from mapctl.runtime.live_protocol import FrameChunk
 from mapctl.runtime.processes import send_queued, spawn
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.streaming.messages import Endpoint, Message
@@ -73,19 +74,13 @@ class Guidance:
         return Guidance(contacts, velocity, forecast.reshape(-1, 3))
 
 
-def guide(
-    root: Float[ndarray, "frames 3"],
-    quats: Float[ndarray, "frames joints 4"],
-    contacts: Float[ndarray, "frames 2"],
-    root_velocity: Float[ndarray, "frames 2"],
-    trajectory: Float[ndarray, "ahead 3"],
-) -> list[Guidance]:
-    """Return the guidance of each frame of a step, whose forecast begins with the frames after it (`SteerFrames`)."""
-    heading = rotations.split_heading(torch.from_numpy(quats[:, 0]))[0].numpy()
-    ahead = np.concatenate([np.column_stack([root[:, ::2], heading]), trajectory])
+def guide(chunk: FrameChunk) -> list[Guidance]:
+    """Return the guidance of each frame of a step, whose forecast begins with the frames after it."""
+    heading = rotations.split_heading(torch.from_numpy(chunk.quats[:, 0]))[0].numpy()
+    ahead = np.concatenate([np.column_stack([chunk.root[:, ::2], heading]), chunk.trajectory])
     ahead[:, 2] = np.degrees(np.angle(np.exp(1j * ahead[:, 2])))
-    points = [ahead[k + _FORECAST_STEP :: _FORECAST_STEP] for k in range(len(root))]
-    return [Guidance(*each) for each in zip(contacts, root_velocity, points, strict=True)]
+    points = [ahead[k + _FORECAST_STEP :: _FORECAST_STEP] for k in range(len(chunk.root))]
+    return [Guidance(*each) for each in zip(chunk.contacts, chunk.root_velocity, points, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,7 +220,6 @@ class PoseStream:
         self.endpoints = [endpoint.offset(k, option=OPTION) for k in range(len(skeletons))]
         family, address = endpoint.resolve(option=OPTION)
         receivers = [(address, one.port) for one in self.endpoints]
-        self.guide = guide
         self._skeletons, self._root_travels, self._delay = list(skeletons), root_travels, delay
         self.statistics = StreamStatistics()
         """Summary of the messages sent; known after `close`."""
@@ -235,28 +229,20 @@ class PoseStream:
         self._queue: queue.SimpleQueue[tuple[object, ...] | None] = queue.SimpleQueue()
         threading.Thread(target=send_queued, args=(self._ours, self._queue), daemon=True).start()
 
-    def put(
-        self,
-        character: int,
-        due: float,
-        seconds: float,
-        root: Float[ndarray, "frames 3"],
-        quats: Float[ndarray, "frames joints 4"],
-        guidance: Sequence[Guidance] = (),
-    ) -> None:
-        """Send frames of a character, at PRIOR_FPS, the first at `due` (a value of time.perf_counter); `seconds` is the
-        stream's time of the first, `root` the hips in the world, metres, `quats` local rotations, xyzw, and `guidance`
-        that of each frame, if there is any (`guide`)."""
+    def put(self, character: int, chunk: FrameChunk) -> None:
+        """Send frames of a character, each when it is due, with its guidance (`guide`)."""
         if self._queue.qsize() > _MAX_QUEUED:
             return
-        skeleton = self._skeletons[character]
-        for k in range(len(root)):
-            at = k / PRIOR_FPS
-            guided = guidance[k] if guidance else None
+        for k, guidance in enumerate(guide(chunk)):
             messages = encode_frame(
-                skeleton, root[k], quats[k], seconds + at, root_travels=self._root_travels, guidance=guided
+                self._skeletons[character],
+                chunk.root[k],
+                chunk.quats[k],
+                chunk.seconds + k / PRIOR_FPS,
+                root_travels=self._root_travels,
+                guidance=guidance,
             )
-            self._queue.put(("put", character, due + at + self._delay, pack(messages)))
+            self._queue.put(("put", character, chunk.due_of(k) + self._delay, pack(messages)))
 
     def forget(self, character: int) -> None:
         """Send nothing of a character that has not been sent: it restarts."""

@@ -252,8 +252,7 @@ class LiveApp:
             return
         for chunk in chunks:
             if self._stream is not None and chunk.due >= self._began:  # what was due before could only come late
-                moved = (chunk.root, chunk.quats, chunk.contacts, chunk.root_velocity, chunk.trajectory)
-                self._stream.put(number, chunk.due, chunk.seconds, chunk.root, chunk.quats, self._stream.guide(*moved))
+                self._stream.put(number, chunk)
             for note in chunk.notes:
                 self.notify(character.name, note)
 

@@ -18,7 +18,7 @@ import priors
 from controllers.generation.generate import SIGMA_PLANTED, sample_stratified_starts
 from mapctl.errors import MapctlError
 from mapctl.metrics import measure
-from mapctl.metrics.realism import RealismSettings, measure_realism
+from mapctl.metrics.realism import RealismSettings, cut_windows, measure_realism
 from mapctl.motion import Motion
 from mapctl.protocols import Density, Refiner
 
@@ -69,7 +69,8 @@ def main(words: list[str] | None = None) -> None:
         for name, motions in result.items():
             row = describe(name, circle.name, motions)
             try:
-                found = measure_realism(motions, clips, generator=seeded(given.seed), settings=settings)
+                windows = [list(map(cut_windows, one)) for one in (motions, clips)]
+                found = measure_realism(*windows, generator=seeded(given.seed), settings=settings)
                 row = {
                     **row,
                     "accuracy": f"{found.accuracy:.0%}",

@@ -13,7 +13,7 @@ from mapctl.metrics import realism
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
     """A small network and few steps."""
-    monkeypatch.setattr(measure, "SETTINGS", realism.RealismSettings(folds=2, steps=5, width=4))
+    monkeypatch.setattr(measure, "SETTINGS", realism.RealismSettings(folds=2, steps=5))
 
 
 @pytest.fixture(scope="module")

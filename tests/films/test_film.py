@@ -22,6 +22,12 @@ Image = pytest.importorskip("PIL.Image")
 SMALL = (96, 64)
 
 
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    """Films of stick figures, unless a test asks for more."""
+    monkeypatch.setenv(renderers.RENDERER_VARIABLE, "stick")
+
+
 def has_graphics() -> bool:
     try:
         return isinstance(select_painter("egl"), Painter)
@@ -53,9 +59,10 @@ def near(picture, colour: str, tolerance: float) -> np.ndarray:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("renderer", RENDERERS)
-def test_an_mp4_has_every_frame_at_the_motions_rate(renderer, tmp_path):
+def test_an_mp4_has_every_frame_at_the_motions_rate(renderer, tmp_path, monkeypatch):
+    monkeypatch.setenv(renderers.RENDERER_VARIABLE, renderer)
     motion, path = walk(18, fps=24), tmp_path / "walk.mp4"
-    assert film([(motion, curves.line(length=2.0))], path, size=SMALL, renderer=renderer) == [path]
+    assert film([(motion, curves.line(length=2.0))], path, size=SMALL) == [path]
     frames, rate, seconds, codec = read_mp4(path)
     assert (len(frames), rate) == (18, Fraction(24))
     assert seconds == pytest.approx(motion.seconds)
@@ -93,7 +100,7 @@ def test_the_curve_and_the_growing_trail_are_seen(renderer):
 
 
 def test_fps_resamples_and_keeps_the_duration(tmp_path):
-    film([Shot(walk(13, fps=12))], tmp_path / "slow.mp4", size=SMALL, fps=6, renderer="stick")
+    film([Shot(walk(13, fps=12))], tmp_path / "slow.mp4", size=SMALL, fps=6)
     frames, rate, *_ = read_mp4(tmp_path / "slow.mp4")
     assert (len(frames), rate) == (7, 6)
 
@@ -102,7 +109,7 @@ def test_fps_resamples_and_keeps_the_duration(tmp_path):
 @pytest.mark.parametrize(("fps", "shown"), [(30, 12), (120, 4)])
 def test_a_loop_keeps_the_motions_time(fps, shown, ending, tmp_path):
     path = tmp_path / f"walk{ending}"
-    film([Shot(walk(12, fps=fps))], path, size=SMALL, renderer="stick")
+    film([Shot(walk(12, fps=fps))], path, size=SMALL)
     with Image.open(path) as loop:
         delays = []
         for k in range(loop.n_frames):
@@ -117,7 +124,7 @@ def test_a_loop_keeps_the_motions_time(fps, shown, ending, tmp_path):
 @pytest.mark.parametrize("actors", [1, 2])
 def test_a_contact_sheet_has_ghosts_over_a_row_of_stills(actors, tmp_path):
     shots = [Shot(moved(walk(24, speed=2.0), turn=0.0, shift=(float(k), 0.0))) for k in range(actors)]
-    film(shots, tmp_path / "sheet.png", size=(192, 108), renderer="stick")
+    film(shots, tmp_path / "sheet.png", size=(192, 108))
     sheet = np.asarray(Image.open(tmp_path / "sheet.png"))
     assert sheet.shape[1] == 192
     assert sheet.shape[0] > 108 + 20
@@ -163,7 +170,7 @@ def test_a_film_that_fails_leaves_nothing_behind_and_an_older_one_alone(tmp_path
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        film([Shot(walk(6))], [old, tmp_path / "new.gif"], size=SMALL, renderer="stick", progress=stop)
+        film([Shot(walk(6))], [old, tmp_path / "new.gif"], size=SMALL, progress=stop)
     assert [path.name for path in tmp_path.iterdir()] == ["old.mp4"]
     assert old.read_bytes() == b"precious"
 

@@ -14,7 +14,7 @@ from mapctl.metrics.realism import measure_diversity
 from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL
 
-QUICK = realism.RealismSettings(steps=60, width=8, batch=32, dims=8)
+QUICK = realism.RealismSettings(steps=60)
 
 
 def clip_set(count: int, frames: int = 61, *, seed: int = 0) -> list[Motion]:
@@ -27,14 +27,14 @@ def clip_set(count: int, frames: int = 61, *, seed: int = 0) -> list[Motion]:
 
 
 def windows_of(motions):
-    return [realism.cut_windows(realism.canonical_positions(motion)) for motion in motions]
+    return [realism.cut_windows(motion) for motion in motions]
 
 
 def test_windows_are_positions_from_the_first_frame_and_velocities():
     clip = walk(75, turn_rate=0.4)
     positions = clip.joint_positions().numpy()
     left, right = (positions[:, CANONICAL.index(f"{side}UpperLeg")] for side in ("left", "right"))
-    got = realism.cut_windows(realism.canonical_positions(clip)).numpy()
+    got = realism.cut_windows(clip).numpy()
     assert got.shape == (5, 30, 2 * 3 * 21)
     for number, start in enumerate(range(0, 45, 10)):
         across = left[start] - right[start]
@@ -80,7 +80,8 @@ def test_two_sets_of_one_kind_are_indistinguishable_and_trembling_is_not():
     mocap, alike = clip_set(24), clip_set(24, seed=1)
     shaky = [trembling(clip, 0.03, seed=k) for k, clip in enumerate(alike)]
     same, other = (
-        realism.measure_realism(result, mocap, generator=generator(4), settings=QUICK) for result in (alike, shaky)
+        realism.measure_realism(windows_of(result), windows_of(mocap), generator=generator(4), settings=QUICK)
+        for result in (alike, shaky)
     )
     assert 0.2 < same.accuracy < 0.8
     assert 0.2 < same.floor_accuracy < 0.8
@@ -106,13 +107,13 @@ def test_the_same_seed_gives_the_same_bits_and_leaves_torch_alone():
 
 @pytest.mark.slow
 def test_too_few_or_too_short_clips_are_refused():
-    clips = clip_set(8, 31)
+    clips = windows_of(clip_set(8, 31))
     with pytest.raises(RequestError, match="at least 8 clips of each, generated and mocap; got 7 and 8"):
         realism.measure_realism(clips[:7], clips, generator=generator())
     with pytest.raises(RequestError, match="20 frames"):
-        realism.measure_realism(clips, [*clips[:2], walk(20), *clips[3:]], generator=generator())
+        realism.cut_windows(walk(20))
     with pytest.raises(RequestError, match="4 folds"):
-        realism.compute_held_out_accuracy(windows_of(clips[:3]), windows_of(clips), generator=generator())
+        realism.compute_held_out_accuracy(clips[:3], clips, generator=generator())
 
 
 def test_diversity_parts_places_from_poses():

@@ -30,11 +30,9 @@ class Stream:
     def __init__(self):
         self.heard: list[tuple] = []
 
-    guide = staticmethod(guide)
-
-    def put(self, character, due, seconds, root, quats, guidance):
-        assert len(guidance) == len(root)
-        self.heard.append(("put", character, seconds, len(root)))
+    def put(self, character, chunk):
+        assert len(guide(chunk)) == len(chunk.root)
+        self.heard.append(("put", character, chunk.seconds, len(chunk.root)))
 
     def forget(self, character):
         self.heard.append(("forget", character))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers import walk
 
+from mapctl.runtime.live_protocol import FrameChunk
 from mapctl.skeleton import CANONICAL
 from mapctl.streaming.messages import Endpoint
 from mapctl.streaming.receiver import read_messages
@@ -15,7 +16,15 @@ from mapctl.streaming.sender import FrameAssembler, PoseStream, VmcFrame
 
 MOTION = walk(30)
 ROOT, QUATS = MOTION.root_position.numpy(), MOTION.local_quat_xyzw.numpy()
+NOTHING = np.zeros((30, 2))
 ALLOWED = 1.0  # seconds by which a busy machine may be late; how late a quiet one is, slow tests say
+
+
+def chunk(due: float, seconds: float, first: int, stop: int) -> FrameChunk:
+    """Frames of the motion."""
+    part, nothing = slice(first, stop), NOTHING[first:stop]
+    arrays = ROOT[part], QUATS[part], nothing, np.zeros((0, 21, 3))
+    return FrameChunk(due, seconds, *arrays, (0.0, 0.0), 0.0, 0.0, 0.0, nothing, np.zeros((0, 3)))
 
 
 def open_ports(count: int, stack: ExitStack) -> list[socket.socket]:
@@ -65,7 +74,7 @@ def start(stream: PoseStream) -> float:
 def test_frames_come_when_they_are_due_and_are_those_that_were_put(stream, ports):
     due = start(stream)
     for first in (3, 0, 6):  # in whatever order they are put
-        stream.put(0, due + first / 30, first / 30, ROOT[first : first + 3], QUATS[first : first + 3])
+        stream.put(0, chunk(due + first / 30, first / 30, first, first + 3))
     found = received(ports[0], 9)
     for k, (at, frame) in enumerate(found):
         assert -0.001 < at - (due + k / 30) < ALLOWED
@@ -80,10 +89,10 @@ def test_frames_come_when_they_are_due_and_are_those_that_were_put(stream, ports
 @pytest.mark.slow
 def test_each_character_has_its_port_and_is_forgotten_alone(stream, ports):
     due = start(stream)
-    stream.put(0, due, 0.0, ROOT[:3], QUATS[:3])
-    stream.put(1, due, 0.0, ROOT[3:6], QUATS[3:6])
+    stream.put(0, chunk(due, 0.0, 0, 3))
+    stream.put(1, chunk(due, 0.0, 3, 6))
     stream.forget(0)
-    stream.put(0, due, 7.0, ROOT[9:10], QUATS[9:10])
+    stream.put(0, chunk(due, 7.0, 9, 10))
     ((_, only),) = received(ports[0], 1)
     assert only.seconds == 7.0
     others = received(ports[1], 3)
@@ -94,7 +103,7 @@ def test_each_character_has_its_port_and_is_forgotten_alone(stream, ports):
 
 def test_late_frames_are_counted_and_sent(stream, ports):
     now = start(stream)
-    stream.put(0, now - 5.0, 0.0, ROOT[:3], QUATS[:3])
+    stream.put(0, chunk(now - 5.0, 0.0, 0, 3))
     assert len(received(ports[0], 3)) == 3
     stream.close()
     assert stream.statistics.late == 3
@@ -104,7 +113,7 @@ def test_late_frames_are_counted_and_sent(stream, ports):
 @pytest.mark.slow
 def test_closing_sends_what_waits(stream, ports):
     due = start(stream)
-    stream.put(0, due, 0.0, ROOT[:9], QUATS[:9])
+    stream.put(0, chunk(due, 0.0, 0, 9))
     stream.close()
     assert len(received(ports[0], 9)) == 9
     assert time.perf_counter() > due + 8 / 30
@@ -115,6 +124,6 @@ def test_a_process_that_has_ended_ends_nothing(stream):
     stream._process.kill()
     stream._process.join()
     for _ in range(100):
-        stream.put(0, time.perf_counter(), 0.0, ROOT[:3], QUATS[:3])
+        stream.put(0, chunk(time.perf_counter(), 0.0, 0, 3))
     stream.close()
     assert stream.statistics.frames_sent == 0

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from mapctl.runtime.live_protocol import FrameChunk
 from mapctl.skeleton import CANONICAL, Skeleton
 from mapctl.streaming import sender
 from mapctl.streaming.messages import Message
@@ -162,7 +163,9 @@ def test_the_forecast_of_each_frame_begins_a_sixth_of_a_second_after_it():
     root, quats = motion.root_position.numpy(), motion.local_quat_xyzw.numpy()
     heading = np.unwrap(2 * np.arctan2(quats[:, 0, 1], quats[:, 0, 3]))
     path = np.column_stack([root[:, ::2], heading])
-    found = sender.guide(root[:3], quats[:3], np.zeros((3, 2)), np.zeros((3, 2)), path[3:34])
+    nothing = np.zeros((3, 2))
+    arrays = root[:3], quats[:3], nothing, np.zeros((0, 21, 3))
+    found = sender.guide(FrameChunk(0.0, 0.0, *arrays, (0.0, 0.0), 0.0, 0.0, 0.0, nothing, path[3:34]))
     for k, each in enumerate(found):
         np.testing.assert_allclose(each.forecast[:, :2], path[k + 5 : 34 : 5, :2])
         np.testing.assert_allclose(each.forecast[:, 2], np.degrees(path[k + 5 : 34 : 5, 2]), atol=1e-6)

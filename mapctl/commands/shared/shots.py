@@ -20,7 +20,7 @@ from controllers.shots.request import Arrival, Lead, Look, Others, PoseKey, Reac
 from controllers.shots.shot import ShotSolution, solve_shot
 from controllers.shots.trajectory import APART_MARGIN, Trajectory, plan_trajectory
 from controllers.shots.walk import FollowSettings
-from mapctl import kinematics, report
+from mapctl import kinematics, metrics, report
 from mapctl.commands.shared.inputs import read_clip
 from mapctl.commands.shared.options import ReadOptions
 from mapctl.commands.shared.outputs import add_licence
@@ -228,8 +228,9 @@ class PlayedShot:
     @cached_property
     def measures(self) -> Mapping[str, float]:
         """Measures of the motion against the trajectory that was planned."""
-        planned, footing = self.solution.trajectory, self.solution.footing
-        found = report.measure_path(self.solution.motion, planned.curve, wanted_m=float(planned.arcs[-1]))
+        planned, footing, motion = self.solution.trajectory, self.solution.footing, self.solution.motion
+        speed = float(planned.arcs[-1]) * float(motion.fps) / (motion.num_frames - 1)
+        found = metrics.measure(motion, planned.curve, speed=speed)
         if footing is None:
             return found
         own = {"planted_share": footing.planted_share, "contact_speed_cm_s": 100 * footing.contact_speed}

@@ -14,13 +14,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits as cross_entrop
 
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, integrate_root
 from mapctl.metrics import measure
-from mapctl.metrics.realism import (
-    WINDOW_FRAMES,
-    RealismSettings,
-    canonical_positions,
-    compute_held_out_accuracy,
-    cut_windows,
-)
+from mapctl.metrics.realism import WINDOW_FRAMES, RealismSettings, compute_held_out_accuracy, cut_windows
 from mapctl.pose import decode
 from priors import checkpoints
 from priors.checkpoints import require_at_least
@@ -314,7 +308,7 @@ def make_evaluator(raw: Corpus, held: Corpus) -> Callable[[RefinerNetwork], dict
 
 
 def _cut_clips(clips: list[Tensor]) -> list[Tensor]:
-    return [cut_windows(canonical_positions(decode(clip, GroundPose.origin()))) for clip in clips]
+    return [cut_windows(decode(clip, GroundPose.origin())) for clip in clips]
 
 
 def sample_corpus(prior: LstmGmmDensity, corpus: Corpus, count: int, frames: int, generator: torch.Generator) -> Corpus:
