@@ -1,10 +1,11 @@
 """`mapctl denoise`: a noisy capture is denoised, on its own rig."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import torch
 from tyro.conf import Positional, arg
@@ -13,17 +14,17 @@ import priors
 from controllers.denoising.causal import denoise_causal
 from controllers.denoising.denoise import CaptureKind, DenoiseSettings, denoise
 from controllers.denoising.solution import DenoiseSolution
-from mapctl import formats, report
 from mapctl.commands.shared import folders, inputs, options, outputs, results
 from mapctl.commands.shared.command import ModelCommand, conclude
 from mapctl.errors import RequestError
 from mapctl.ground import Ground
-from mapctl.motion import join_licences
-from mapctl.protocols import Denoiser, Inbetweener
-from mapctl.recording.masks import load_masks, masks_from_missing
+from mapctl.recording.masks import load_masks
 from mapctl.retarget.rigs import Rig
+from mapctl.runtime.stepwise import Progress
 from mapctl.skeleton import CANONICAL
-from priors import weight_sets
+from priors import checkpoints, weight_sets
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,9 @@ def run(command: Denoise) -> int:
         if not idle:
             raise RequestError(f"--{name} is for folders; {command.source} is a file")
     results.check_destinations(command.out, command.video, command.report, given=(command.source,))
-    done = _denoise_file(command)
+    rig = inputs.read_rig(command.rig, command)
+    with outputs.show_progress("denoising", quiet=command.quiet) as progress:
+        done = _denoise_file(command, rig, progress)
     results.write_result("denoise", command, done, done.capture, rig=done.rig)
     if not command.quiet:
         moved, (joint, frame, most) = float(done.correction()[0].mean()), done.find_largest_move()
@@ -119,31 +122,37 @@ def run(command: Denoise) -> int:
     return conclude(done.status, strict=command.strict)
 
 
-def _denoise_file(command: Denoise) -> DenoiseSolution:
-    rig = inputs.read_rig(command.rig, command)
+def _denoise_file(command: Denoise, rig: Rig | None, progress: Progress | None = None) -> DenoiseSolution:
     named_masks = () if command.mask is None else load_masks(command.mask)
-    densities = priors.load_choice(command.prior)
-    denoiser = priors.load_denoiser(command.denoiser)
+    densities, denoiser = priors.load_choice(command.prior), _load(priors.load_denoiser, command.denoiser)
     motion, missing_masks, _ = inputs.read_motion_with_gaps(
         command.source, rig, markers=command.markers, quiet=command.quiet
     )
     masks = (*named_masks, *missing_masks)
-    with outputs.show_progress("denoising", quiet=command.quiet) as progress:
-        if command.causal:
-            delay = _DEFAULT_DELAY if command.delay is None else command.delay
-            return denoise_causal(
-                motion, denoiser, masks=masks, settings=command.settings, delay=delay, rig=rig, progress=progress
-            )
-        return denoise(
-            motion,
-            denoiser,
-            inbetweener=priors.load_inbetweener(command.inbetweener or "transformer"),
-            masks=masks,
-            settings=command.settings,
-            densities=densities,
-            rig=rig,
-            progress=progress,
+    if command.causal:
+        delay = _DEFAULT_DELAY if command.delay is None else command.delay
+        return denoise_causal(
+            motion, denoiser, masks=masks, settings=command.settings, delay=delay, rig=rig, progress=progress
         )
+    return denoise(
+        motion,
+        denoiser,
+        inbetweener=_load(priors.load_inbetweener, command.inbetweener or "transformer"),
+        masks=masks,
+        settings=command.settings,
+        densities=densities,
+        rig=rig,
+        progress=progress,
+    )
+
+
+def _load(load: Callable[[str], T], name: str) -> T:
+    """Load a network, once a process; its licence is noted each time."""
+    checkpoints.note_use(name)
+    return _load_once(load, name)
+
+
+_load_once = cache(lambda load, name: load(name))
 
 
 def _format_certainty(done: DenoiseSolution) -> list[str]:
@@ -207,12 +216,15 @@ def _run_folder(command: Denoise) -> int:
         raise RequestError(f"--jobs is for this machine; the cluster at {command.cluster} has workers of its own")
     if command.report is not None:
         outputs.check_folder(command.report)
-    names = (priors.add_set(command.denoiser), priors.add_set(command.inbetweener or "transformer"))
-    _load(*names)  # a typing error is reported once, now; and what processes use is recorded here
+    denoiser, inbetweener = map(priors.add_set, (command.denoiser, command.inbetweener or "transformer"))
+    # A typing error is reported once, now; and what processes use is recorded here.
+    _load(priors.load_denoiser, denoiser)
+    _load(priors.load_inbetweener, inbetweener)
+    named = replace(command, denoiser=denoiser, inbetweener=inbetweener)
     return folders.run_folder(
         command.source,
         command.out,
-        FileDenoiser(command, *names, inputs.read_rig(command.rig, command), dict(weight_sets.find_used_licences())),
+        FileDenoiser(named, inputs.read_rig(command.rig, command)),
         label="denoising",
         done="denoised",
         again=command.again,
@@ -227,35 +239,19 @@ class FileDenoiser:
     """Denoiser of the files of a folder, cheap to send to a process, which loads the networks on first use."""
 
     command: Denoise
-    denoiser: str
-    """Name of the denoiser, with its set of weights."""
-    inbetweener: str
-    """Name of the network that fills what is lost for longer."""
+    """Options for the folder; networks are named with their set of weights."""
     rig: Rig | None
     """Rig of all files, where it is not the one that would be recognised."""
-    licences: dict[str, str]
-    """Licences of the models; that of the motion joins them."""
 
     def __call__(self, source: Path, out: Path) -> tuple[int, float]:
         """Denoise one file and write the result and its report; return frames and seconds of compute."""
         torch.set_num_threads(1)
-        command, unit = self.command, None if self.rig is None else self.rig.metres_per_unit
-        motion, missing = formats.load_with_missing(source, metres_per_unit=unit, markers=command.markers)
-        if not command.quiet:
-            inputs.print_doubts(source, motion, self.rig)
-        masks, (denoiser, inbetweener) = masks_from_missing(motion, missing), _load(self.denoiser, self.inbetweener)
-        done = denoise(motion, denoiser, inbetweener=inbetweener, masks=masks, settings=command.settings, rig=self.rig)
-        own = {str(source): weight_sets.shorten_licence(motion.licence)} if motion.licence else {}
-        if command.report is not None:
-            path = (command.report / out.relative_to(command.out)).with_suffix(".json")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            found = results.build_report("denoise", command, done)
-            report.write_report(found | weight_sets.describe_licences(self.licences | own), path)
-        models = weight_sets.format_licences(weight_sets.shorten_names(self.licences))
-        formats.save(replace(done.motion, licence=join_licences((models, motion.licence))), out)
+        report = self.command.report
+        if report is not None:
+            report = (report / out.relative_to(self.command.out)).with_suffix(".json")
+            report.parent.mkdir(parents=True, exist_ok=True)
+        command = replace(self.command, source=source, out=out, report=report)
+        with weight_sets.record_licences():
+            done = _denoise_file(command, self.rig)
+            results.write_result("denoise", command, done, done.capture, rig=done.rig)
         return done.motion.num_frames, done.seconds
-
-
-@cache
-def _load(denoiser: str, inbetweener: str) -> tuple[Denoiser, Inbetweener]:
-    return priors.load_denoiser(denoiser), priors.load_inbetweener(inbetweener)

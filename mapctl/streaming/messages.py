@@ -1,5 +1,6 @@
 """OSC messages as plain values, and the endpoint HOST:PORT at which they are sent or received."""
 
+import math
 import re
 import socket
 from dataclasses import dataclass, field
@@ -20,6 +21,11 @@ class Message:
     """Arguments, in order. A float is sent as 32 bits."""
     packed: bytes = field(default=b"", compare=False, repr=False)
     """Its bytes, where it was received."""
+
+
+def is_number(value: object) -> bool:
+    """Return whether an argument is a finite number."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 LOOPBACK = "127.0.0.1"

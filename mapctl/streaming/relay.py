@@ -4,8 +4,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from mapctl.streaming.messages import Message
-from mapctl.streaming.orders import is_number
+from mapctl.streaming.messages import Message, is_number
 from mapctl.streaming.sender import (
     AVAILABLE,
     BONE,

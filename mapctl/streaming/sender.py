@@ -27,8 +27,7 @@ from mapctl.features import PRIOR_FPS
 from mapctl.runtime.live_protocol import FrameChunk
 from mapctl.runtime.processes import send_queued, spawn
 from mapctl.skeleton import CANONICAL, Skeleton
-from mapctl.streaming.messages import Endpoint, Message
-from mapctl.streaming.orders import is_number
+from mapctl.streaming.messages import Endpoint, Message, is_number
 from mapctl.streaming.post import StreamStatistics, run_post
 
 OK, TIME, ROOT, BONE = "/VMC/Ext/OK", "/VMC/Ext/T", "/VMC/Ext/Root/Pos", "/VMC/Ext/Bone/Pos"

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mapctl.intent.steering import STEP_LENGTHS, Command
-from mapctl.streaming.orders import is_number
+from mapctl.streaming.messages import is_number
 from scenes.live.page import PageState
 
 UNCONDITIONED = "any"

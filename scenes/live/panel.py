@@ -7,7 +7,7 @@ import viser
 
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.steering import STEP_LENGTHS
-from mapctl.streaming.orders import is_number
+from mapctl.streaming.messages import is_number
 from scenes.live import paths
 from scenes.live.camera import CameraMode
 from scenes.live.character import KEPT_SECONDS, ShownCharacter

@@ -12,8 +12,8 @@ from pythonosc.udp_client import SimpleUDPClient
 
 from mapctl.errors import RequestError
 from mapctl.streaming.messages import Endpoint, Message
-from mapctl.streaming.orders import Order, keep_latest, read_order
 from mapctl.streaming.receiver import MAX_DATAGRAM_BYTES, OscReceiver
+from scenes.live.remote import Order, keep_latest, read_order
 
 GROUPS = ("gait", "style")
 
