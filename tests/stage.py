@@ -34,7 +34,7 @@ def delivered(first: int = 0, count: int = 3, *, spare: float = 0.02) -> FrameCh
 
 
 class Actor:
-    """A LiveCharacter that notes what it is sent."""
+    """A CharacterProcess that notes what it is sent."""
 
     skeleton = CANONICAL
 

@@ -10,7 +10,7 @@ import math
 import time
 from collections.abc import Generator
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float
@@ -32,34 +32,14 @@ from mapctl.intent.steering import Arrival, Command, SteeringTarget
 from mapctl.pose import decode
 from mapctl.runtime.stepwise import StepwiseWork
 
+if TYPE_CHECKING:
+    from priors.stitcher import Stitcher
+
 LEAST_FRAMES = 4
 """Frames of the shortest stitched trajectory."""
 _FAR = 0.3  # metres beyond which the direction to a target is the facing there
 _CANDIDATES = 4  # moments of the prior that are tried at the position
 _AFTER = 10  # frames of the prior's own continuation, as context of how motion continues from there
-
-
-@runtime_checkable
-class TransitionMaker(Protocol):
-    """Model that generates the frames between two poses."""
-
-    @property
-    def longest(self) -> int:
-        """Most frames between two poses."""
-        ...
-
-    def connect(
-        self,
-        before: Float[Tensor, "before size"],
-        after: Float[Tensor, "batch after size"],
-        position: Float[Tensor, "batch 2"],
-        turn: Float[Tensor, " batch"],
-        frames: int,
-    ) -> Generator[None, None, Float[Tensor, "batch frames size"]]:
-        """Generate, a frame at a time, features from the frame after the last of `before` to the last of `after`, which
-        runs backwards, `frames` later, at `position`, metres, and turned by `turn`, relative to the last of `before`.
-        """
-        ...
 
 
 def needed_speed(state: SteerState, order: Arrival, frames: int) -> float:
@@ -69,7 +49,7 @@ def needed_speed(state: SteerState, order: Arrival, frames: int) -> float:
 
 
 def plan_stitch(
-    transitions: TransitionMaker, state: SteerState, command: Command, order: Arrival, frames: int
+    transitions: "Stitcher", state: SteerState, command: Command, order: Arrival, frames: int
 ) -> Generator[None, None, Float[Tensor, "frames size"]]:
     """Plan the frames to a target, a frame at a time, in the pose there to which the motion is smoothest."""
     character = state.character
@@ -123,8 +103,8 @@ _LEAST_SPEED = 0.3  # m/s below which the character does not set out: there is t
 class Arriver:
     """A step of steering that obeys orders to be somewhere."""
 
-    transitions: TransitionMaker
-    """Model of the stitch."""
+    transitions: "Stitcher"
+    """Model of the frames between two poses."""
 
     def __call__(
         self, state: SteerState, command: Command, *, seconds: float | None = None

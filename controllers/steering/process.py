@@ -34,52 +34,13 @@ from mapctl.errors import MapctlError, RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.intent.steering import Arrival, Command, SteeringLimits
 from mapctl.protocols import Density
-from mapctl.runtime.live_protocol import FrameChunk, LiveCharacter
+from mapctl.runtime.live_protocol import FrameChunk
 from mapctl.runtime.processes import preload, send_queued, spawn
 from mapctl.skeleton import CANONICAL, Skeleton
 
 _ARRIVAL_DISTANCE = 0.15  # metres before the end of a path at which the character stops
 _SEARCH_BACKWARD, _SEARCH_FORWARD = 0.1, 0.5  # metres around the last nearest arc in which the next is searched
-_SEARCH_POINTS = 61
-
-
-class PurePursuit:
-    """A source, `at`, and a display that takes the character's position, `show`. Closed curves have no end."""
-
-    def __init__(self, curve: Curve, *, speed: float, look_ahead: float = 0.5):
-        """Begin at the curve's start; `speed` in m/s; `look_ahead` in metres: less tracks closer and sways more."""
-        self.curve, self.speed, self.look_ahead = curve, speed, look_ahead
-        self.arc = 0.0
-        self.position = self._point(0.0)
-
-    @property
-    def first(self) -> Command:
-        """First command, at the curve's first point."""
-        return Command(self.speed, self.curve.start_heading)
-
-    @property
-    def left(self) -> float | None:
-        """Arc left from the point last nearest to the character to the end of an open curve, metres; None on a closed
-        one."""
-        return None if self.curve.closed else self.curve.length - self.arc
-
-    def show(self, frames: SteerFrames, due: float) -> None:
-        """Keep where the character is; when its frames are `due` (seconds of the stream) does not matter."""
-        self.position = frames.motion.root_position[-1, ::2]
-
-    def at(self, seconds: float) -> Command:
-        """Return the command towards the point ahead of the character; how many seconds of the stream have passed does
-        not matter."""
-        first, last = self.arc - _SEARCH_BACKWARD, self.arc + _SEARCH_FORWARD
-        arcs = torch.linspace(first, last, _SEARCH_POINTS, dtype=torch.float64)
-        distances = (self.curve.ground_point(arcs) - self.position).norm(dim=-1)
-        self.arc = float(arcs[distances.argmin()])
-        direction = self._point(self.arc + self.look_ahead) - self.position
-        return Command(self.speed, math.atan2(float(direction[0]), float(direction[1])))
-
-    def _point(self, arc: float) -> torch.Tensor:
-        """Return x and z of the curve at an arc, float64, metres."""
-        return self.curve.point(arc)[[0, -1]].double()
+_SEARCH_POINTS, _LOOK_AHEAD = 61, 0.5  # metres along the path to the point that is headed for
 
 
 class Autopilot:
@@ -88,13 +49,14 @@ class Autopilot:
     def __init__(self, command: Command, limits: SteeringLimits):
         """Begin with a command; `limits` determine how soon to brake before the end of a path."""
         self._command, self._limits = command, limits
-        self._pursuit: PurePursuit | None = None
+        self._path: Curve | None = None
+        self._arc = 0.0  # of the path's point last nearest to the character, metres
         self._goal: Arrival | None = None  # its time counted from when it is requested
-        self._last: SteerFrames | None = None
+        self._position: torch.Tensor | None = None  # of the hips, x and z, metres
 
     def command(self, command: Command) -> None:
         """Hold this command from now on."""
-        self._command, self._pursuit, self._goal = command, None, None
+        self._command, self._path, self._goal = command, None, None
 
     def go(self, command: Command, position: tuple[float, float], within: float, facing: float | None) -> None:
         """Be at a `position` (x, z, metres) `within` so many seconds from the next step, `facing` a heading (radians),
@@ -115,33 +77,34 @@ class Autopilot:
     def walk(self, curve: Curve, speed: float) -> None:
         """Walk along a curve at a `speed` in m/s, with the step length and labels of the last command; stop at the end
         of an open one."""
-        self._pursuit, self._goal = PurePursuit(curve, speed=speed), None
-        self._command = replace(self._command, arrival=None)
-        if self._last is not None:
-            self._pursuit.show(self._last, 0.0)
+        self._path, self._arc, self._goal = curve, 0.0, None
+        self._command = replace(self._command, speed=speed, arrival=None)
 
     def show(self, frames: SteerFrames, due: float) -> None:
         """Keep where the character is; when its frames are `due` (seconds of the stream) does not matter."""
-        self._last = frames
-        if self._pursuit is not None:
-            self._pursuit.show(frames, due)
+        self._position = frames.motion.root_position[-1, ::2]
 
     def at(self, seconds: float) -> Command:
-        """Return the command that holds now, at so many seconds of the stream."""
+        """Return the command that holds now, at so many seconds of the stream; on a path that towards a point ahead."""
         if self._goal is not None:
             self._command = replace(self._command, arrival=replace(self._goal, by=seconds + self._goal.by))
             self._goal = None
-        if self._pursuit is None:
+        if self._path is None:
             return self._command
-        pursued, left = self._pursuit.at(seconds), self._pursuit.left
-        led = replace(self._command, speed=pursued.speed, heading=pursued.heading, facing=None, turning=None)
-        if left is None:
+        path, here = self._path, self._position if self._position is not None else self._path.ground_point(0.0)
+        first, last = self._arc - _SEARCH_BACKWARD, self._arc + _SEARCH_FORWARD
+        arcs = torch.linspace(first, last, _SEARCH_POINTS, dtype=torch.float64)
+        self._arc = float(arcs[(path.ground_point(arcs) - here).norm(dim=-1).argmin()])
+        heading = math.atan2(*(path.ground_point(self._arc + _LOOK_AHEAD) - here).tolist())
+        led = replace(self._command, heading=heading, facing=None, turning=None)
+        if path.closed:
             return led
-        if left <= _ARRIVAL_DISTANCE:
+        left = path.length - self._arc - _ARRIVAL_DISTANCE
+        if left <= 0:
             self.command(replace(led, speed=0.0, step_length=None))
             return self._command
         # The highest speed from which braking stops in time: v^2 = 2 a s.
-        return replace(led, speed=min(led.speed, math.sqrt(2 * self._limits.braking * (left - _ARRIVAL_DISTANCE))))
+        return replace(led, speed=min(led.speed, math.sqrt(2 * self._limits.braking * left)))
 
 
 _TURN = 0.618034  # share of a step between processes one after the other: multiples of the golden ratio spread evenly
@@ -309,7 +272,7 @@ _PROCESS_ENDED = "a character's process ended by itself"
 preload("controllers.steering.process")
 
 
-class CharacterProcess(LiveCharacter):
+class CharacterProcess:
     """A live character in a process of its own; no order waits. RequestError for points that make no curve, for a
     position without `transitions` in the request, and for numbers that are not finite. A reset of a process that has
     ended starts it again, which takes a while."""
@@ -329,26 +292,34 @@ class CharacterProcess(LiveCharacter):
             raise RequestError(self._failed)
 
     def command(self, command: Command) -> None:
+        """Obey this command from now on, as far as possible (see `FrameChunk.notes`), and follow no path."""
         self._send("command", command)
 
     def walk(self, points: Sequence[tuple[float, float]], speed: float, *, closed: bool = False) -> None:
+        """Walk along a smooth curve through two or more points (x and z, metres) at a speed in m/s, then stand; on and
+        on along a closed one."""
         positions = np.array(points, dtype=np.float64).reshape(-1, 2)
         curves.through(positions, closed=closed)  # so that errors are raised here, not in the process
         self._send("walk", positions, speed, closed)
 
     def aim(self, command: Command) -> None:
+        """Reach, look and walk round obstacles as in this command; nothing else of it counts, and a path is kept."""
         self._send("aim", command)
 
     def go(self, command: Command, position: tuple[float, float], within: float, facing: float | None = None) -> None:
+        """Be at a position (x and z, metres) in so many seconds, facing so (radians; None as it comes there), if that
+        is possible, and obey the command from then on; a note gives the reason if not."""
         if self._request.transitions is None:
             raise RequestError("this character has no transitions, which take it to a position")
         Arrival(position, within, facing)  # so that errors are raised here, not in the process
         self._send("go", command, position, within, facing)
 
     def pause(self, paused: bool) -> None:
+        """Stop the clock, or let it go on."""
         self._send("pause", paused)
 
     def reset(self) -> None:
+        """Restart from the initial pose; also a character that has ended."""
         if self._failed:
             self.close()
             self._start()
@@ -356,6 +327,7 @@ class CharacterProcess(LiveCharacter):
             self._send("reset")
 
     def poll(self) -> list[FrameChunk]:
+        """Return what was delivered since the last call, oldest first. MapctlError if the character has ended."""
         failed, found = self._failed, list[FrameChunk]()  # in this order: frames before the end are kept
         while self._delivered:
             found.append(self._delivered.popleft())
@@ -377,6 +349,7 @@ class CharacterProcess(LiveCharacter):
         self.close()
 
     def close(self) -> None:
+        """End the character; harmless the second time."""
         self._send("close")
         self._process.join(2.0 if self._ready.is_set() else 0.1)  # while it loads it does not listen yet
         if self._process.is_alive():

@@ -59,38 +59,30 @@ class Live(ModelCommand, options.ReadOptions, streaming.StreamOptions):
 
 
 def run(command: Live) -> int:
-    """Check, open, serve until Ctrl-C."""
+    """Check, open, serve until Ctrl-C; whatever was opened is closed, also where the rest cannot be."""
     _check(command)
-    receiver = streaming.open_receiver(command.listen)
-    try:
-        return _serve(command, receiver)
-    finally:
+    with ExitStack() as opened:
+        receiver = streaming.open_receiver(command.listen)
         if receiver is not None:
-            receiver.close()
-
-
-def _serve(command: Live, receiver: "OscReceiver | None") -> int:
-    show, stream = _open_app(command, receiver)
-    try:
+            opened.callback(receiver.close)
+        show, stream = _open_app(command, receiver, opened)
         if not show.url.endswith(f":{command.port}"):
             print(f"port {command.port} is in use")
         for line in streaming.describe(stream, receiver):
             print(line)
         print(f"open {show.url} in a browser; Ctrl-C ends", flush=True)
-        show.run()
-    except KeyboardInterrupt:
-        print()
-        for path in show.save_recordings(Path.cwd()):
-            print(f"the recording is in {path.name}")
-    finally:
-        show.close()
-        if stream is not None:
-            stream.close()
-            print(streaming.summarise(stream))
+        try:
+            show.run()
+        except KeyboardInterrupt:
+            print()
+            for path in show.save_recordings(Path.cwd()):
+                print(f"the recording is in {path.name}")
+    if stream is not None:
+        print(streaming.summarise(stream))
     return 0
 
 
-def _open_app(command: Live, receiver: "OscReceiver | None") -> "tuple[LiveApp, PoseStream | None]":
+def _open_app(command: Live, receiver: "OscReceiver | None", opened: ExitStack) -> "tuple[LiveApp, PoseStream | None]":
     from scenes.live.app import LiveApp
     from scenes.live.character import CharacterLook
 
@@ -99,22 +91,20 @@ def _open_app(command: Live, receiver: "OscReceiver | None") -> "tuple[LiveApp, 
     bodies, licence = _read_bodies(command, drawn), outputs.format_used_licences()
     rigs = _choose_recorded_rigs(command, drawn, bodies)
     looks = [CharacterLook(*one, licence) for one in zip(drawn, rigs, strict=True)]
-    characters = _start_characters(command, bodies)
-    with ExitStack() as undo:  # a page that does not open leaves no process behind
-        for character in characters:
-            undo.callback(character.close)
-        skeletons = [character.skeleton for character in characters]
-        stream = streaming.open_stream(command, skeletons)
-        show = LiveApp(
-            characters,
-            looks,
-            port=command.port,
-            fastest=prior.limits.max_steering_speed,
-            labels=prior.labels,
-            stream=stream,
-            source=receiver,
-        )
-        undo.pop_all()
+    characters = _start_characters(command, bodies, opened)
+    stream = streaming.open_stream(command, [character.skeleton for character in characters])
+    if stream is not None:
+        opened.callback(stream.close)
+    show = LiveApp(
+        characters,
+        looks,
+        port=command.port,
+        fastest=prior.limits.max_steering_speed,
+        labels=prior.labels,
+        stream=stream,
+        source=receiver,
+    )
+    opened.callback(show.close)
     return show, stream
 
 
@@ -162,26 +152,20 @@ def _choose_recorded_rigs(
     return [body.on_rig if one is None else carry for one, body in zip(drawn, bodies, strict=True)]
 
 
-def _start_characters(command: Live, bodies: Sequence[Character]) -> Sequence[CharacterProcess]:
-    load = functools.partial(priors.load, priors.add_set(command.prior))
-    positions = [
-        (_START_SPACING * (number - (command.characters - 1) / 2), 0.0) for number in range(command.characters)
-    ]
+def _start_characters(command: Live, bodies: Sequence[Character], opened: ExitStack) -> Sequence[CharacterProcess]:
+    """Start the characters side by side, all at once, and wait until they walk."""
     found: list[CharacterProcess] = []
-    with ExitStack() as undo:
-        for number, (at, own) in enumerate(zip(positions, bodies, strict=True)):
-            request = CharacterRequest(
-                load,
-                Command(1.2, 0.0),
-                command.seed + number,
-                at,
-                SteerSettings(liveliness=command.liveliness, footing=FootContact(rest_height=own.toe_rest_height)),
-                own.skeleton,
-                transitions=functools.partial(priors.load_stitcher, priors.add_set(_STITCHER)),
-            )
-            found.append(CharacterProcess(request))
-            undo.callback(found[-1].close)
-        for character in found:
-            character.wait()
-        undo.pop_all()
+    for number, own in enumerate(bodies):
+        request = CharacterRequest(
+            functools.partial(priors.load, priors.add_set(command.prior)),
+            Command(1.2, 0.0),
+            command.seed + number,
+            (_START_SPACING * (number - (len(bodies) - 1) / 2), 0.0),
+            SteerSettings(liveliness=command.liveliness, footing=FootContact(rest_height=own.toe_rest_height)),
+            own.skeleton,
+            transitions=functools.partial(priors.load_stitcher, priors.add_set(_STITCHER)),
+        )
+        found.append(opened.enter_context(CharacterProcess(request)))
+    for character in found:
+        character.wait()
     return found

@@ -1,16 +1,13 @@
-"""Protocol between a character that is steered live and its viewer; neither imports the other."""
+"""Frames of a character that is steered live, as they pass between processes."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from numpy import ndarray
 
 from mapctl.features import PRIOR_FPS
-from mapctl.intent.steering import Command
 from mapctl.motion import Motion
 from mapctl.skeleton import Skeleton
 
@@ -59,45 +56,3 @@ class FrameChunk:
     def motion(self, skeleton: Skeleton) -> Motion:
         """Return the frames as a motion of that skeleton."""
         return Motion(skeleton, Fraction(PRIOR_FPS), torch.from_numpy(self.root), torch.from_numpy(self.quats))
-
-
-@runtime_checkable
-class LiveCharacter(Protocol):
-    """A character that moves by itself in real time and takes orders at any moment."""
-
-    skeleton: Skeleton
-    """Skeleton of the character."""
-
-    def command(self, command: Command) -> None:
-        """Obey this command from now on, as far as possible (see `FrameChunk.notes`), and follow no path."""
-        ...
-
-    def walk(self, points: Sequence[tuple[float, float]], speed: float, *, closed: bool = False) -> None:
-        """Walk along a smooth curve through two or more points (x and z, metres) at a speed in m/s, then stand; on and
-        on along a closed one."""
-        ...
-
-    def aim(self, command: Command) -> None:
-        """Reach, look and walk round obstacles as in this command; nothing else of it counts, and a path is kept."""
-        ...
-
-    def go(self, command: Command, position: tuple[float, float], within: float, facing: float | None = None) -> None:
-        """Be at a position (x and z, metres) in so many seconds, facing so (radians; None as it comes there), if that
-        is possible, and obey the command from then on; a note gives the reason if not."""
-        ...
-
-    def pause(self, paused: bool) -> None:
-        """Stop the clock, or let it go on."""
-        ...
-
-    def reset(self) -> None:
-        """Restart from the initial pose; also a character that has ended."""
-        ...
-
-    def poll(self) -> list[FrameChunk]:
-        """Return what was delivered since the last call, oldest first. MapctlError if the character has ended."""
-        ...
-
-    def close(self) -> None:
-        """End the character; harmless the second time."""
-        ...

@@ -16,7 +16,6 @@ import viser
 
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import MapctlError, RequestError
-from mapctl.runtime.live_protocol import LiveCharacter
 from scenes.live.camera import WorldView
 from scenes.live.character import CharacterLook, ShownCharacter
 from scenes.live.inputs import HELP, KEYS, Driving, InputLimits
@@ -28,6 +27,7 @@ from scenes.live.remote import RemoteCommands
 from scenes.live.targets import LiveTargets
 
 if TYPE_CHECKING:  # python-osc may not be installed
+    from controllers.steering.process import CharacterProcess
     from mapctl.streaming.receiver import OscReceiver
     from mapctl.streaming.sender import PoseStream
 
@@ -46,7 +46,7 @@ class LiveApp:
 
     def __init__(
         self,
-        characters: Sequence[LiveCharacter],
+        characters: "Sequence[CharacterProcess]",
         looks: Sequence[CharacterLook],
         *,
         port: int,

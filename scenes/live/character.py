@@ -4,6 +4,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -20,11 +21,14 @@ from mapctl.mesh.mannequin import at_rest, build_skin
 from mapctl.mesh.primitives import Array
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap
-from mapctl.runtime.live_protocol import FrameChunk, LiveCharacter
+from mapctl.runtime.live_protocol import FrameChunk
 from mapctl.skeleton import TOE_JOINTS
 from scenes.drawn_character import DrawnCharacter
 from scenes.live.camera import facing_of, to_rgb_bytes
 from scenes.live.inputs import SteeringInputs
+
+if TYPE_CHECKING:
+    from controllers.steering.process import CharacterProcess
 
 KEPT_SECONDS = 120.0
 """Seconds of shown frames that are kept for looking back."""
@@ -203,9 +207,11 @@ class CharacterLook:
 
 
 class ShownCharacter:
-    """A LiveCharacter with its inputs and all that the browser shows of it."""
+    """A live character with its inputs and all that the browser shows of it."""
 
-    def __init__(self, scene: viser.SceneApi, world: str, number: int, character: LiveCharacter, look: CharacterLook):
+    def __init__(
+        self, scene: viser.SceneApi, world: str, number: int, character: "CharacterProcess", look: CharacterLook
+    ):
         """Set up character `number`, from 0, with its nodes below the node `world`."""
         self.name, self.character, self.look = f"Character {number + 1}", character, look
         self.inputs = SteeringInputs()

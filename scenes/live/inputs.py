@@ -44,7 +44,7 @@ class SteeringInputs:
 
     @property
     def command(self) -> Command:
-        """Command for a LiveCharacter."""
+        """Command for the character."""
         return Command(
             self.speed,
             math.radians(self.heading),

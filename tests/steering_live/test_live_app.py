@@ -10,12 +10,12 @@ from helpers import run as run_command
 from helpers import walk
 from stage import Actor, delivered, live_app, run
 
+from controllers.steering.process import CharacterProcess
 from mapctl import formats
 from mapctl.commands import live
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import MapctlError, RequestError
 from mapctl.intent.steering import Command
-from mapctl.runtime.live_protocol import LiveCharacter
 from scenes.live.app import LiveApp
 from scenes.live.camera import CameraMode
 from scenes.live.character import CharacterLook
@@ -33,7 +33,7 @@ def words(actor: Actor, *kinds: str) -> list[tuple]:
 def test_it_listens_on_this_machine_only(show):
     assert show.url.startswith("http://127.0.0.1:")
     assert show.server.get_host() == "127.0.0.1"
-    assert isinstance(Actor(), LiveCharacter)
+    assert {name for name in vars(CharacterProcess) if name[0] != "_"} - {"wait", "pid"} <= {*dir(Actor)}
 
 
 def test_a_port_that_is_taken_is_named_and_another_one_serves(monkeypatch, capsys, prior):

@@ -1,6 +1,7 @@
 """Characters in the live viewer: what a browser makes of what it is sent is the character's mesh in its pose."""
 
 import time
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
@@ -133,14 +134,12 @@ def test_a_character_moves_on_its_own_bones(prior, tmp_path):
     child = str(make_character_glb(tmp_path / "child.glb", size=0.6).path)
     command = Live(character=(child,), prior=prior)
     (drawn,) = live._read_drawn(command)
-    (result,) = live._start_characters(command, live._read_bodies(command, [drawn]))
-    try:
+    with ExitStack() as opened:
+        (result,) = live._start_characters(command, live._read_bodies(command, [drawn]), opened)
         assert result.skeleton.matches(drawn.body.leveled)
         chunk = next(chunk for _ in range(200) for chunk in result.poll() or _wait())
         height = float(chunk.motion(result.skeleton).joint_positions()[0, 0, 1])
         assert height == pytest.approx(0.6 * 0.95, abs=0.08), "hips of a child"
-    finally:
-        result.close()
 
 
 def _wait() -> list:

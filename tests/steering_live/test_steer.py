@@ -12,10 +12,11 @@ from tiny_steering import AHEAD, DENSITY, QUICK, begun
 import priors
 from controllers.steering import steer
 from controllers.steering.loop import Recorder, StepRecord, StreamClock, drive, summarise_step_timing
-from controllers.steering.process import PurePursuit
+from controllers.steering.process import Autopilot
 from mapctl import curves
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import RequestError
+from mapctl.intent.steering import SteeringLimits
 
 
 def steered(steps, command=AHEAD, **how):
@@ -175,13 +176,14 @@ def test_latency_runs_from_the_arrival_to_the_first_frame_that_could_change():
 
 def test_pursuit_heads_for_the_curve_ahead_of_the_character():
     curve = curves.line(length=10)
-    pursuit = PurePursuit(curve, speed=1.0, look_ahead=0.5)
-    assert pursuit.at(0).heading == pytest.approx(curve.start_heading)
+    pilot = Autopilot(AHEAD, SteeringLimits())
+    pilot.walk(curve, 1.0)
+    assert pilot.at(0).heading == pytest.approx(curve.start_heading)
     x, z = curve.point(0.3)[[0, -1]].tolist()
     _, first = steer.begin(DENSITY, AHEAD, generator=generator(), at=(x + 0.5, z))
-    pursuit.show(first, 0.0)
-    assert pursuit.at(0.1).heading == pytest.approx(-math.pi / 4, abs=0.02)
-    assert pursuit.arc == pytest.approx(0.3, abs=0.01)
+    pilot.show(first, 0.0)
+    assert pilot.at(0.1).heading == pytest.approx(-math.pi / 4, abs=0.02)
+    assert pilot.at(0.1).speed == 1.0
 
 
 def test_obstacles_lead_the_direction_round_and_hold_joints_off():

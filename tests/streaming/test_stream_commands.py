@@ -97,7 +97,7 @@ def test_characters_obey_what_comes_over_osc_and_their_poses_go_out(prior, tmp_p
     """The whole of `mapctl live` but the browser: two characters in their processes, on tiny models."""
     stitcher = functools.partial(priors.load_stitcher, str(save_tiny_stitcher(tmp_path / "s.safetensors")))
 
-    def start(command, drawn):
+    def start(command, drawn, opened):
         load = functools.partial(priors.load, prior)
         requests = [CharacterRequest(load, Command(1.2, 0.0), at=(3.0 * k, 0.0), transitions=stitcher) for k in (0, 1)]
         result = [CharacterProcess(request) for request in requests]
