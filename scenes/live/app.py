@@ -36,7 +36,6 @@ _HOUSEKEEPING_TICKS = 15
 _REPEAT_SECONDS = 10.0  # before the same note is shown again
 _NOTE_SECONDS = 8.0  # for which a note is shown
 _DEFAULT_SPEED = 1.2  # m/s of a path for a character that stands
-_WORLD = "/world"
 
 
 class LiveApp:
@@ -67,30 +66,18 @@ class LiveApp:
         self._queue: queue.SimpleQueue[Callable[[], Any]] = queue.SimpleQueue()
         self._noted: dict[str, float] = {}
         scene = self.server.scene
-        self.view = WorldView(self.server, _WORLD, characters=len(characters))
+        self.view = WorldView(self.server, characters=len(characters))
         self.characters = [
-            ShownCharacter(scene, _WORLD, number, *one)
-            for number, one in enumerate(zip(characters, looks, strict=True))
+            ShownCharacter(scene, number, *one) for number, one in enumerate(zip(characters, looks, strict=True))
         ]
         self.chosen = self.characters[0]
-        self.targets = LiveTargets(scene, _WORLD, self.characters, lambda: self.chosen, self.enqueue)
-        self.path = PathEditor(
-            scene, _WORLD, locate=self.view.find_ground, enqueue=self.enqueue, on_change=self._show_path
-        )
+        self.targets = LiveTargets(self)
+        self.path = PathEditor(self)
         self.recorder = Recorder(self.server, self.notify)
         self.timeline = Timeline(self.characters, self._set_paused)
         self.panel = Panel(self.server.gui, self, characters=len(characters))
         self.panel.show_inputs(self.chosen.inputs)
-        walk_speed = min(1.2, self.limits.fastest)
-        self.driving = Driving(
-            steer=self._drive,
-            act=self._act,
-            find_heading=self.view.find_heading,
-            find_facing=lambda: math.degrees(self.chosen.facing),
-            find_lock=self._find_lock,
-            fastest=self.limits.fastest,
-            walk_speed=walk_speed,
-        )
+        self.driving = Driving(self)
         self._lock: float | None = None
         self._remote = None if source is None else RemoteCommands(source, self)
         scene.on_click()(lambda event: self.enqueue(lambda: self.click(event.ray_origin, event.ray_direction)))
@@ -267,7 +254,8 @@ class LiveApp:
             self.panel.show_inputs(character.inputs)
             self.targets.show()
 
-    def _show_path(self, text: str) -> None:
+    def show_path(self, text: str) -> None:
+        """Show a line on the path, and whether it is closed."""
         self.panel.closed.value = self.path.is_closed
         self.panel.path.content = text
 
@@ -282,11 +270,12 @@ class LiveApp:
         for character in self.characters:
             self._run_safely(lambda one=character: one.pause(paused, seconds))
 
-    def _drive(self, speed: float, heading: float | None, facing: float | None) -> None:
+    def steer(self, speed: float, heading: float | None, facing: float | None) -> None:
+        """Steer the chosen character at a speed, m/s; headings in degrees, None keeps or frees them."""
         kept = {} if heading is None else {"heading": heading}
         self.change(self.chosen, {"speed": speed, "facing": facing} | kept)
 
-    def _find_lock(self) -> float | None:
+    def find_lock(self) -> float | None:
         """Return the locked facing of the chosen character, degrees: toward its target where there is one."""
         inputs, position = self.chosen.inputs, self.chosen.position
         target = inputs.look_at or next(iter(inputs.reach.values()), None)
@@ -296,9 +285,10 @@ class LiveApp:
 
     def _toggle_lock(self) -> None:
         self._lock = self.view.find_heading((0.0, 1.0), None) if self._lock is None else None
-        self.change(self.chosen, {"facing": self._find_lock()})
+        self.change(self.chosen, {"facing": self.find_lock()})
 
-    def _act(self, key: str) -> None:
+    def act(self, key: str) -> None:
+        """Do what a key of ACTIONS does."""
         actions: dict[str, Callable[[], Any]] = {
             "KeyX": lambda: self.change(self.chosen, {"speed": 0.0}),
             "KeyL": self._toggle_lock,

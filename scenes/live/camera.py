@@ -17,6 +17,8 @@ _MOVE_RATE = 3.5  # 1/s: how soon the camera is where the character is; at an ev
 _TURN_RATE = 1.8  # 1/s: how soon it is behind it; slow enough that hips which sway do not rock it
 _JUMP_METRES = 2.0  # that no character goes in a frame: it was put elsewhere
 _LONGEST_STEP = 0.1  # seconds; a page that slept does not leap
+WORLD = "/world"
+"""Name of the node below which everything is that the camera turns."""
 FOV = math.radians(40.0)
 """Vertical field of view, radians."""
 _BODY_RADIUS, _BODY_MIDDLE = 1.1, 0.92  # metres around a character, and its height
@@ -94,11 +96,11 @@ def _relax(off: Any, speed: Any, rate: float, seconds: float) -> tuple[Any, Any]
 class WorldView:
     """Floor and light, the node of the world as the chase camera turns it, and the cameras of all browsers."""
 
-    def __init__(self, server: viser.ViserServer, world: str, *, characters: int):
-        """Add the node `world`, floor and light; several characters are followed without turning."""
+    def __init__(self, server: viser.ViserServer, *, characters: int):
+        """Add the node of the world, floor and light; several characters are followed without turning."""
         self._server, scene = server, server.scene
         scene.set_up_direction("+y")
-        self._world = scene.add_frame(world, show_axes=False)
+        self._world = scene.add_frame(WORLD, show_axes=False)
         self._lamp = scene.add_frame("/lamp", show_axes=False)
         self.chase = ChaseCamera(CameraMode.CHASE if characters == 1 else CameraMode.FOLLOW)
         self._stepped: float | None = None
@@ -110,7 +112,7 @@ class WorldView:
         scene.add_light_hemisphere("/sky", sky_color=(236, 242, 255), ground_color=(150, 146, 140), intensity=0.42)
         scene.set_background_image(np.full((2, 2, 3), to_rgb_bytes(colours.BACKGROUND), np.uint8), format="png")
         scene.add_grid(
-            f"{world}/floor",
+            f"{WORLD}/floor",
             plane="xz",
             infinite_grid=True,
             cell_size=1.0,
@@ -184,12 +186,6 @@ def turn_about_up(points: Array, angle: float) -> Array:
     c, s = math.cos(angle), math.sin(angle)
     x, y, z = np.moveaxis(np.asarray(points, dtype=np.float64), -1, 0)
     return np.stack([c * x + s * z, y, c * z - s * x], axis=-1)
-
-
-def facing_of(quat_xyzw: Array) -> float:
-    """Return the facing of hips with a rotation (4,), radians from +Z toward +X."""
-    x, y, z, w = quat_xyzw
-    return math.atan2(2 * (x * z + w * y), 1 - 2 * (x * x + y * y))
 
 
 def to_rgb_bytes(colour: str) -> tuple[int, int, int]:

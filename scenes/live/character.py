@@ -11,7 +11,7 @@ import scipy
 import torch
 import viser
 
-from mapctl import rotations
+from mapctl import kinematics, rotations
 from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import MapctlError
 from mapctl.features import PRIOR_FPS
@@ -24,7 +24,7 @@ from mapctl.retarget import RigMap
 from mapctl.runtime.live_protocol import FrameChunk
 from mapctl.skeleton import TOE_JOINTS
 from scenes.drawn_character import DrawnCharacter
-from scenes.live.camera import facing_of, to_rgb_bytes
+from scenes.live.camera import WORLD, to_rgb_bytes
 from scenes.live.inputs import SteeringInputs
 
 if TYPE_CHECKING:
@@ -119,6 +119,10 @@ def find_carriers(rigmap: RigMap) -> Array:
     return np.array(found)
 
 
+def _find_facing(chunk: FrameChunk, frame: int) -> float:
+    return float(kinematics.heading(torch.from_numpy(chunk.quats[frame, 0])))
+
+
 def _interpolate(first: Pose, second: Pose, share: float) -> Pose:
     """Return the pose between two, in lines and by the shortest arcs."""
     quats = torch.from_numpy(first[1]), torch.from_numpy(second[1])
@@ -209,10 +213,8 @@ class CharacterLook:
 class ShownCharacter:
     """A live character with its inputs and all that the browser shows of it."""
 
-    def __init__(
-        self, scene: viser.SceneApi, world: str, number: int, character: "CharacterProcess", look: CharacterLook
-    ):
-        """Set up character `number`, from 0, with its nodes below the node `world`."""
+    def __init__(self, scene: viser.SceneApi, number: int, character: "CharacterProcess", look: CharacterLook):
+        """Set up character `number`, from 0, with its nodes."""
         self.name, self.character, self.look = f"Character {number + 1}", character, look
         self.inputs = SteeringInputs()
         self.recorded: list[FrameChunk] | None = None
@@ -227,10 +229,10 @@ class ShownCharacter:
         """Frames that were shown, oldest first."""
         self.frames = self.late_frames = 0
         """Frames, and late ones of them, since the last reset."""
-        path, colour = f"{world}/character{number + 1}", colours.default_colour(number)
+        path, colour = f"{WORLD}/character{number + 1}", colours.default_colour(number)
         mesh = build_skin(at_rest(character.skeleton), colour) if look.drawn is None else look.drawn.mesh
         self._body = SkinnedBody(scene, path, mesh, look.drawn)
-        self.marks = Marks(scene, f"{world}/marks{number + 1}")
+        self.marks = Marks(scene, f"{WORLD}/marks{number + 1}")
         self._waiting: deque[DueFrame] = deque()
         self._shown: DueFrame | None = None
 
@@ -283,7 +285,7 @@ class ShownCharacter:
         recent = np.array([one.chunk.root[one.frame, ::2] for one in self.past[-_SPEED_FRAMES:]])
         speed = float(np.linalg.norm(recent[-1] - recent[0])) * PRIOR_FPS / (len(recent) - 1)
         chunk = self.past[-1].chunk
-        off = math.degrees(math.remainder(facing_of(chunk.quats[-1, 0]) - chunk.target_facing, 2 * math.pi))
+        off = math.degrees(math.remainder(_find_facing(chunk, -1) - chunk.target_facing, 2 * math.pi))
         is_slow = self.frames > PRIOR_FPS / 2 and 2 * self.late_frames >= self.frames
         warning = "  \n⚠️ This machine is too slow." if is_slow else ""
         return (
@@ -316,7 +318,7 @@ class ShownCharacter:
         before, self._shown = self._shown, self.past[index]
         chunk, k = self._shown.chunk, self._shown.frame
         self._body.pose(self._shown.pose)
-        self.position, self.facing = chunk.root[k, ::2], facing_of(chunk.quats[k, 0])
+        self.position, self.facing = chunk.root[k, ::2], _find_facing(chunk, k)
         joints = chunk.motion(self.character.skeleton).joint_positions()[k].numpy()
         self.marks.show_feet(joints[list(TOE_JOINTS)], chunk.contacts[k])
         if back or before is None or before.chunk is not chunk:  # the bands change ten times a second

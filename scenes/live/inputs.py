@@ -1,15 +1,18 @@
 """Inputs of one character: what it is requested and its limits, and the held keys and sticks that change it."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mapctl.intent.steering import STEP_LENGTHS, Command
 from mapctl.streaming.messages import is_number
 from scenes.live.page import PageState
+
+if TYPE_CHECKING:
+    from scenes.live.app import LiveApp
 
 UNCONDITIONED = "any"
 """The choice that gives a prior no label."""
@@ -145,29 +148,18 @@ Steering = tuple[float, float | None, float | None]
 """Speed, m/s, heading and facing, degrees; None keeps the heading, and faces the direction of travel."""
 
 
-@dataclass
 class Driving:
     """Held keys and sticks of each page; the first page that holds some is obeyed, and the character stands when all
     are released or their page is gone."""
 
-    steer: Callable[[float, float | None, float | None], None]
-    """Steer at a speed with heading and facing (Steering)."""
-    act: Callable[[str], None]
-    """Do what a key of ACTIONS does."""
-    find_heading: Callable[[tuple[float, float], int | None], float]
-    """Return the heading, degrees, of a direction to the right and away as a viewer's camera sees it."""
-    find_facing: Callable[[], float]
-    """Return the character's facing, degrees."""
-    find_lock: Callable[[], float | None]
-    """Return the facing that is locked, degrees; None where none is."""
-    fastest: float
-    """The prior's fastest speed, m/s."""
-    walk_speed: float = 1.2
-    """Speed of a held key, m/s; Shift runs."""
-    _pages: dict[int, PageState] = field(default_factory=dict)
-    _given: Steering | None = None
-    _given_at: float = -math.inf
-    _kept: float | None = None
+    def __init__(self, app: "LiveApp"):
+        self._app = app
+        self.walk_speed = min(1.2, app.limits.fastest)
+        """Speed of a held key, m/s; Shift runs."""
+        self._pages: dict[int, PageState] = {}
+        self._given: Steering | None = None
+        self._given_at = -math.inf
+        self._kept: float | None = None  # facing while it strafes, degrees
 
     def update(self, page: int, state: PageState | None) -> None:
         """Take the state of a page; None if it is gone."""
@@ -177,7 +169,7 @@ class Driving:
         before = self._pages.get(page, PageState())
         self._pages[page] = state
         for code in sorted((state.keys - before.keys) & ACTIONS.keys()):
-            self.act(code)
+            self._app.act(code)
 
     def step(self, now: float) -> None:
         """Steer by what is held at a value of time.perf_counter."""
@@ -186,14 +178,14 @@ class Driving:
         if asked is None:
             self._given = self._kept = None
             if before is not None:
-                self.steer(0.0, None, before[2])
+                self._app.steer(0.0, None, before[2])
         elif before is None or (_differ(asked, before) and now - self._given_at >= _ORDER_SECONDS):
             self._given, self._given_at = asked, now
-            self.steer(*asked)
+            self._app.steer(*asked)
 
     def _read(self, page: PageState) -> Steering | None:
         """Return what a page asks for; None where it asks for nothing."""
-        run_speed = max(self.walk_speed, 0.75 * self.fastest)
+        run_speed = max(self.walk_speed, 0.75 * self._app.limits.fastest)
         direction, speed = find_direction(page.keys), run_speed if page.keys & FAST else self.walk_speed
         if page.stick is not None and (pushed := _push(page.stick)) is not None:
             direction, push = pushed
@@ -201,14 +193,14 @@ class Driving:
             speed = round(max(0.3, top * push), 2)
         facing = None
         if (aimed := _push(page.aim)) is not None:
-            facing = self.find_heading(aimed[0], page.viewer)
-        elif direction is not None and (locked := self.find_lock()) is not None:
+            facing = self._app.view.find_heading(aimed[0], page.viewer)
+        elif direction is not None and (locked := self._app.find_lock()) is not None:
             facing = locked
         elif page.keys & STRAFE:
-            self._kept = facing = self.find_facing() if self._kept is None else self._kept
+            self._kept = facing = math.degrees(self._app.chosen.facing) if self._kept is None else self._kept
         if direction is None:
             return None if facing is None else (0.0, None, facing)
-        return speed, self.find_heading(direction, page.viewer), facing
+        return speed, self._app.view.find_heading(direction, page.viewer), facing
 
 
 def _push(stick: tuple[float, ...] | None) -> tuple[tuple[float, float], float] | None:

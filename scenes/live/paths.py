@@ -2,10 +2,10 @@
 
 import math
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -17,7 +17,10 @@ from mapctl.curves.curve import Curve
 from mapctl.errors import FileFormatError, MapctlError, RequestError
 from mapctl.mesh import colours
 from mapctl.mesh.primitives import Array
-from scenes.live.camera import to_rgb_bytes
+from scenes.live.camera import WORLD, to_rgb_bytes
+
+if TYPE_CHECKING:
+    from scenes.live.app import LiveApp
 
 ENDINGS = (".csv", ".tsv", ".txt", ".svg")
 """Endings of files that are read."""
@@ -84,26 +87,15 @@ def read_path(name: str, content: bytes) -> tuple[list[Point], bool]:
 class PathEditor:
     """The path in all browsers: a line, and balls at its points, which are dragged and, with Ctrl, removed by a click.
 
-    Its methods are for the loop's thread; `enqueue` runs there what browsers drag and click.
+    Its methods are for the loop's thread.
     """
 
-    def __init__(
-        self,
-        scene: viser.SceneApi,
-        world: str,
-        *,
-        locate: Callable[[Any, Any], Point | None],
-        enqueue: Callable[[Callable[[], None]], None],
-        on_change: Callable[[str], None],
-    ):
-        """Add the path below the node `world`. `locate` returns where a ray meets the ground; `on_change` is given a
-        line on the path after each change."""
+    def __init__(self, app: "LiveApp"):
         self.points: list[Point] = []
         """Points (x, z) in order, metres."""
         self.is_closed = False
         """Whether the last is followed by the first."""
-        self._scene, self._name, self._locate, self._enqueue = scene, f"{world}/path", locate, enqueue
-        self._on_change = on_change
+        self._app, self._scene, self._name = app, app.server.scene, f"{WORLD}/path"
         ball = trimesh.creation.icosphere(subdivisions=2, radius=_BALL_RADIUS)
         self._ball = np.asarray(ball.vertices, np.float32), np.asarray(ball.faces, np.uint32)
         self._line: viser.LineSegmentsHandle | None = None
@@ -117,8 +109,8 @@ class PathEditor:
         return None
 
     def edit(self, points: Sequence[Point], *, closed: bool | None = None) -> None:
-        """Take other points, and whether they are closed; what cannot be done goes to `on_change`, and changes
-        nothing."""
+        """Take other points, and whether they are closed; what cannot be done is shown in the panel, and
+        changes nothing."""
         closed = self.is_closed if closed is None else closed
         try:
             if len(points) >= 2 and len(set(points)) > 1:
@@ -126,7 +118,7 @@ class PathEditor:
             self.points, self.is_closed = list(points), closed
             self._show()
         except MapctlError as error:
-            self._on_change(f"⚠️ {error}")
+            self._app.show_path(f"⚠️ {error}")
 
     def add(self, point: Point) -> None:
         """Add a point at the end, unless a ball is there: browsers report a click on a ball here too."""
@@ -147,7 +139,7 @@ class PathEditor:
         try:
             points, closed = read_path(name, content)
         except MapctlError as error:
-            self._on_change(f"⚠️ {error}")
+            self._app.show_path(f"⚠️ {error}")
         else:
             self.edit(points, closed=closed)
 
@@ -168,7 +160,7 @@ class PathEditor:
                 self._balls.remove()
             self._balls = self._add_balls(positions, red) if count else None
         length = "" if curve is None else f", {curve.length:.1f} m"
-        self._on_change(f"{count} point{'s' * (count != 1)}{length}." if count else HELP)
+        self._app.show_path(f"{count} point{'s' * (count != 1)}{length}." if count else HELP)
 
     def _add_balls(self, positions: Array, colour: tuple[int, int, int]) -> viser.BatchedMeshHandle:
         """Add the balls as one node that reports which of them is dragged or clicked."""
@@ -188,17 +180,17 @@ class PathEditor:
             index, origin = event.instance_index, np.asarray(event.client.camera.position)
             if index is not None and event.phase != "end":  # where a drag ends the mouse may be anywhere
                 ray = origin, np.asarray(event.end_position) - origin
-                self._enqueue(lambda: self.drag(index, ray))
+                self._app.enqueue(lambda: self.drag(index, ray))
 
         @balls.on_click(modifier="cmd/ctrl")
         async def _(event: viser.SceneNodePointerEvent) -> None:
             index = event.instance_index
             if index is not None:
-                self._enqueue(lambda: self.remove(index))
+                self._app.enqueue(lambda: self.remove(index))
 
         return balls
 
     def drag(self, index: int, ray: Ray) -> None:
         """Move a point to where the mouse's ray meets the ground."""
-        if (point := self._locate(*ray)) is not None:
+        if (point := self._app.view.find_ground(*ray)) is not None:
             self.move(index, point)

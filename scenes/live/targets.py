@@ -1,18 +1,20 @@
 """Handles that users drag: a target for hands and gaze, and a disc that all characters walk round."""
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import viser
 
 from mapctl.curves.obstacles import Obstacle
 from mapctl.mesh import colours
-from scenes.live.camera import to_rgb_bytes
+from scenes.live.camera import WORLD, to_rgb_bytes
 from scenes.live.character import ShownCharacter
 from scenes.live.inputs import Point, SteeringInputs, parse_point
+
+if TYPE_CHECKING:
+    from scenes.live.app import LiveApp
 
 _HANDLE_SIZE, _BALL_RADIUS, _GOAL_RADIUS = 0.25, 0.045, 0.08  # metres
 _DISC_HEIGHT, _DISC_COLOUR, _DISC_AHEAD = 0.35, (185, 170, 156), 2.5
@@ -22,52 +24,45 @@ _TARGET_AHEAD, _TARGET_ASIDE, _TARGET_HEIGHT = 0.45, 0.3, 1.2  # metres from a c
 class LiveTargets:
     """A target for each character, of which the chosen one's is shown, and a disc for all of them.
 
-    Its methods are for the loop's thread; `enqueue` runs there what browsers drag.
+    Its methods are for the loop's thread.
     """
 
-    def __init__(
-        self,
-        scene: viser.SceneApi,
-        world: str,
-        characters: Sequence[ShownCharacter],
-        chosen: Callable[[], ShownCharacter],
-        enqueue: Callable[[Callable[[], None]], None],
-    ):
-        """Add the handles below the node `world`, hidden."""
-        self._scene, self._world, self._characters, self._chosen = scene, world, characters, chosen
+    def __init__(self, app: "LiveApp"):
+        """Add the handles, hidden."""
+        self._app, scene = app, app.server.scene
         self.obstacles: tuple[Obstacle, ...] = ()
         look: dict[str, Any] = {"disable_rotations": True, "depth_test": False, "visible": False}
         red = to_rgb_bytes(colours.TARGET)
-        self.target = scene.add_transform_controls(f"{world}/target", _HANDLE_SIZE, **look)
-        scene.add_icosphere(f"{world}/target/ball", _BALL_RADIUS, color=red)
+        self.target = scene.add_transform_controls(f"{WORLD}/target", _HANDLE_SIZE, **look)
+        scene.add_icosphere(f"{WORLD}/target/ball", _BALL_RADIUS, color=red)
         ground = (True, False, True)
-        self.disc = scene.add_transform_controls(f"{world}/disc", 2 * _HANDLE_SIZE, active_axes=ground, **look)
-        self._goal = scene.add_icosphere(f"{world}/goal", _GOAL_RADIUS, color=red, visible=False)
+        self.disc = scene.add_transform_controls(f"{WORLD}/disc", 2 * _HANDLE_SIZE, active_axes=ground, **look)
+        self._goal = scene.add_icosphere(f"{WORLD}/goal", _GOAL_RADIUS, color=red, visible=False)
         for handle, moved in ((self.target, self.move_target), (self.disc, self.move_disc)):
 
             @handle.on_update
             async def _(event: viser.TransformControlsEvent, handle: Any = handle, moved: Any = moved) -> None:
                 point = parse_point(handle.position)
                 if event.client_id is not None and point is not None:  # not where the server moves it
-                    enqueue(lambda: moved(point))
+                    app.enqueue(lambda: moved(point))
 
     def reach(self, hand: str | None) -> None:
         """Have the chosen character reach for the target with a hand, or with none."""
-        inputs = self._chosen().inputs
+        inputs = self._app.chosen.inputs
         self._aim(replace(inputs, reach={hand: self._find_target(hand)} if hand else {}))
 
     def look(self, looks: bool) -> None:
         """Have the chosen character look at the target, or not."""
-        self._aim(replace(self._chosen().inputs, look_at=self._find_target(None) if looks else None))
+        self._aim(replace(self._app.chosen.inputs, look_at=self._find_target(None) if looks else None))
 
     def move_target(self, point: Point) -> None:
         """Move the chosen character's target, metres."""
-        inputs = self._chosen().inputs
+        inputs = self._app.chosen.inputs
         self._aim(replace(inputs, reach=dict.fromkeys(inputs.reach, point), look_at=inputs.look_at and point))
 
     def show(self) -> None:
         """Show the chosen character's target where it has one."""
-        inputs = self._chosen().inputs
+        inputs = self._app.chosen.inputs
         point = next(iter(inputs.reach.values()), inputs.look_at)
         self.target.visible = point is not None
         if point is not None:
@@ -76,7 +71,7 @@ class LiveTargets:
     def put_disc(self, radius: float | None) -> None:
         """Put a disc of a radius, metres, where there is one already or ahead of the chosen character; None removes
         it."""
-        x, z = self._chosen().position + _DISC_AHEAD * self._axes()[0]
+        x, z = self._app.chosen.position + _DISC_AHEAD * self._axes()[0]
         position = self.obstacles[0].place if self.obstacles else (float(x), float(z))
         self.set_disc(None if radius is None else Obstacle(position, radius))
 
@@ -91,8 +86,8 @@ class LiveTargets:
         self.disc.visible = disc is not None
         if disc is not None and disc.radius is not None:
             self.disc.position = (disc.place[0], _DISC_HEIGHT, disc.place[1])
-            self._scene.add_cylinder(
-                f"{self._world}/disc/solid",
+            self._app.server.scene.add_cylinder(
+                f"{WORLD}/disc/solid",
                 disc.radius,
                 _DISC_HEIGHT,
                 color=_DISC_COLOUR,
@@ -100,7 +95,7 @@ class LiveTargets:
                 wxyz=(math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0),
                 position=(0.0, -_DISC_HEIGHT / 2, 0.0),
             )
-        for character in self._characters:
+        for character in self._app.characters:
             character.aim(self.obstacles)
 
     def go(self, character: ShownCharacter, position: tuple[float, float], within: float, facing: float | None) -> None:
@@ -111,18 +106,18 @@ class LiveTargets:
         self._goal.position, self._goal.visible = (position[0], 0.0, position[1]), True
 
     def _aim(self, inputs: SteeringInputs) -> None:
-        self._chosen().inputs = inputs
-        self._chosen().aim(self.obstacles)
+        self._app.chosen.inputs = inputs
+        self._app.chosen.aim(self.obstacles)
         self.show()
 
     def _find_target(self, hand: str | None) -> Point:
         """Return the chosen character's target; one before it, on the hand's side, where it has none."""
-        inputs, (ahead, left) = self._chosen().inputs, self._axes()
+        inputs, (ahead, left) = self._app.chosen.inputs, self._axes()
         side = {"left": 1.0, "right": -1.0}.get(hand or "", 0.0)
-        x, z = self._chosen().position + _TARGET_AHEAD * ahead + side * _TARGET_ASIDE * left
+        x, z = self._app.chosen.position + _TARGET_AHEAD * ahead + side * _TARGET_ASIDE * left
         return next(iter(inputs.reach.values()), inputs.look_at) or (float(x), _TARGET_HEIGHT, float(z))
 
     def _axes(self) -> tuple[np.ndarray, np.ndarray]:
-        heading = math.radians(self._chosen().inputs.heading)
+        heading = math.radians(self._app.chosen.inputs.heading)
         ahead = np.array([math.sin(heading), math.cos(heading)])
         return ahead, np.array([ahead[1], -ahead[0]])

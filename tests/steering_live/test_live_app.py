@@ -111,13 +111,13 @@ def test_a_lock_faces_the_target_as_the_character_passes_it(show, actors):
     show.targets.look(True)
     show.targets.move_target((3.0, 1.1, 0.0))
     show.chosen.position = np.array([0.0, 0.0])
-    show._act("KeyL")
+    show.act("KeyL")
     assert actors[0].heard[-1][1].facing == pytest.approx(math.pi / 2)
     show.chosen.position = np.array([3.0, -2.0])
     show.driving.update(0, PageState(keys={"KeyD"}))
     show.driving.step(0.0)
     assert actors[0].heard[-1][1].facing == pytest.approx(0.0)
-    show._act("KeyL")
+    show.act("KeyL")
     assert actors[0].heard[-1][1].facing is None
 
 

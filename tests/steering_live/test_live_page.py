@@ -130,15 +130,23 @@ class Deck:
 
     def __init__(self):
         self.heard: list[tuple] = []
-        self.driving = Driving(
-            steer=lambda *asked: self.heard.append(("steer", *asked)),
-            act=lambda action: self.heard.append(("act", action)),
-            find_heading=lambda direction, viewer: 90.0 - math.degrees(math.atan2(*direction)),
-            find_facing=lambda: next(self.facing),
-            find_lock=lambda: self.locked,
-            fastest=3.8,
-        )
-        self.facing, self.locked = iter((70.0, 75.0)), None
+        self._facings, self.locked = iter((70.0, 75.0)), None
+        self.chosen, self.view, self.limits = self, self, InputLimits(3.8, {})
+        self.driving = Driving(self)
+
+    facing = property(lambda self: math.radians(next(self._facings)))
+
+    def steer(self, *asked):
+        self.heard.append(("steer", *asked))
+
+    def act(self, action):
+        self.heard.append(("act", action))
+
+    def find_heading(self, direction, viewer):
+        return 90.0 - math.degrees(math.atan2(*direction))
+
+    def find_lock(self):
+        return self.locked
 
     def hold(self, *codes: str, page: int = 0, at: float | None = None) -> None:
         self.driving.update(page, PageState(keys=frozenset(codes)))
