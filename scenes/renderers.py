@@ -9,9 +9,8 @@ thin bright rim that lifts a figure off the ground. All in linear light; sRGB in
 import logging
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from enum import Enum
 from functools import cache
 from types import ModuleType
 from typing import Any, Literal
@@ -88,31 +87,21 @@ _RIM = 0.10
 _GAMMA = 2.2
 
 
-class Layer(Enum):
-    """How triangles cover what is behind them."""
-
-    SOLID = "opaque, from both sides"
-    SHEER = "seen through, in the order of the faces"
-
-
-def list_layers(ground: Sequence[Surface], bodies: Sequence[Surface], eye: Array) -> dict[Layer, Surface]:
-    """List what there is of each layer, shaded as seen from `eye` (3,); layers without a triangle are left out.
-
-    Sheer is the ground, and over it the triangles of bodies that are not opaque, the furthest first.
-    """
-    layers: dict[Layer, list[Surface]] = {layer: [] for layer in Layer}
-    layers[Layer.SHEER] += [shade(surface, eye) for surface in ground]
+def list_layers(ground: Sequence[Surface], bodies: Sequence[Surface], eye: Array) -> list[Surface | None]:
+    """List what is opaque, from both sides, and what is seen through, in the order of its faces, shaded as seen from
+    `eye` (3,): the ground, and over it the triangles of bodies that are not opaque, the furthest first. None for what
+    has no triangles."""
+    solid, sheer = list[Surface](), [shade(surface, eye) for surface in ground]
     for body in (shade(one, eye) for one in bodies):
         # Vertices of opaque triangles have no opacity, by which a mesh as a whole would count as seen through.
-        solid = replace(body, rgba=np.column_stack([body.rgba[:, :3], np.ones(len(body.rgba))]))
+        opaque = replace(body, rgba=np.column_stack([body.rgba[:, :3], np.ones(len(body.rgba))]))
         is_sheer = (body.rgba[body.faces, 3] < _OPAQUE).any(axis=1)
-        layers[Layer.SOLID].append(replace(solid, faces=body.faces[~is_sheer]))
-        if is_sheer.any():
-            faces = body.faces[is_sheer]
-            away = np.linalg.norm(body.vertices[faces].mean(axis=1) - eye, axis=1)
-            layers[Layer.SHEER].append(replace(body, faces=faces[np.argsort(-away)]))
-    merged = {layer: merge_surfaces(surfaces) for layer, surfaces in layers.items() if surfaces}
-    return {layer: surface for layer, surface in merged.items() if len(surface.faces)}
+        solid.append(replace(opaque, faces=body.faces[~is_sheer]))
+        faces = body.faces[is_sheer]
+        away = np.linalg.norm(body.vertices[faces].mean(axis=1) - eye, axis=1)
+        sheer.append(replace(body, faces=faces[np.argsort(-away)]))
+    merged = [merge_surfaces(surfaces) if surfaces else None for surfaces in (solid, sheer)]
+    return [surface if surface is not None and len(surface.faces) else None for surface in merged]
 
 
 def shade(surface: Surface, eye: Array) -> Surface:
@@ -152,10 +141,10 @@ class OffscreenPainter:
         gl = self._gl
         self._scene = gl.Scene(bg_color=[*colours.rgb(colours.BACKGROUND), 1.0])
         self._camera = self._scene.add(gl.PerspectiveCamera(yfov=1.0, znear=_CLIP_NEAR, zfar=_CLIP_FAR))
-        looks = {Layer.SOLID: {"doubleSided": True}, Layer.SHEER: {"doubleSided": True, "alphaMode": "BLEND"}}
-        self._looks = {
-            layer: gl.MetallicRoughnessMaterial(baseColorFactor=[1.0] * 4, **look) for layer, look in looks.items()
-        }
+        self._looks = [
+            gl.MetallicRoughnessMaterial(baseColorFactor=[1.0] * 4, doubleSided=True, alphaMode=mode)
+            for mode in ("OPAQUE", "BLEND")
+        ]
 
     def paint(self, view: View, content: Content) -> Array:
         """Paint the picture, (height, width, 3) uint8."""
@@ -177,14 +166,15 @@ class OffscreenPainter:
             self._scene.remove_node(node)
         return picture
 
-    def _add(self, layers: Mapping[Layer, Surface]) -> list[Any]:
+    def _add(self, layers: Sequence[Surface | None]) -> list[Any]:
         """Add each layer as one mesh: a draw call costs more than a body's triangles, and the order stays."""
         nodes = []
-        for layer, surface in layers.items():
-            primitive = self._gl.Primitive(
-                positions=surface.vertices, indices=surface.faces, color_0=surface.rgba, material=self._looks[layer]
-            )
-            nodes.append(self._scene.add(self._gl.Mesh([primitive])))
+        for surface, look in zip(layers, self._looks, strict=True):
+            if surface is not None:
+                primitive = self._gl.Primitive(
+                    positions=surface.vertices, indices=surface.faces, color_0=surface.rgba, material=look
+                )
+                nodes.append(self._scene.add(self._gl.Mesh([primitive])))
         return nodes
 
 

@@ -3,10 +3,8 @@
 import io
 import re
 import zipfile
-from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib.resources import files
-from importlib.resources.abc import Traversable
+from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Annotated
 
@@ -25,26 +23,15 @@ _READABLE = 0o644 << 16
 def build_addon_zip() -> bytes:
     """Build the zip of the add-on: its modules, and the manifest with the version of this package."""
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, text in sorted(read_addon_files().items()):
-            entry = zipfile.ZipInfo(name, _EPOCH)
+    with as_file(files("mapctl.blender").joinpath("addon")) as folder, zipfile.ZipFile(buffer, "w") as archive:
+        for path in sorted(path for path in folder.rglob("*") if path.suffix in (".py", ".toml")):
+            text = path.read_text("utf-8")
+            if path.name == _MANIFEST:
+                text = re.sub(r'^version = ".*"$', f'version = "{__version__}"', text, flags=re.M)
+            entry = zipfile.ZipInfo(path.relative_to(folder).as_posix(), _EPOCH)
             entry.compress_type, entry.external_attr, entry.create_system = zipfile.ZIP_DEFLATED, _READABLE, 3
             archive.writestr(entry, text)
     return buffer.getvalue()
-
-
-def read_addon_files() -> dict[str, str]:
-    """Read the files of the add-on by their names in the zip."""
-    found = dict(_read_folder(files("mapctl.blender").joinpath("addon"), ""))
-    return found | {_MANIFEST: re.sub(r'^version = ".*"$', f'version = "{__version__}"', found[_MANIFEST], flags=re.M)}
-
-
-def _read_folder(folder: Traversable, prefix: str) -> Iterator[tuple[str, str]]:
-    for entry in folder.iterdir():
-        if entry.is_dir():
-            yield from _read_folder(entry, f"{prefix}{entry.name}/")
-        elif entry.name.endswith((".py", ".toml")):
-            yield prefix + entry.name, entry.read_text("utf-8")
 
 
 @dataclass(frozen=True)
