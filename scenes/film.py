@@ -7,7 +7,6 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from fractions import Fraction
 from functools import partial
-from importlib import import_module
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
@@ -43,7 +42,8 @@ def mp4_writer(path: Path, size: tuple[int, int], fps: Fraction) -> Iterator[Wri
 
     4:2:0 colour needs even sides, so odd ones get one more row or column like their last.
     """
-    av = _import_package("av")
+    import av
+
     # The encoder logs what it does on standard error by default.
     av.logging.set_level(av.logging.ERROR)
     width, height = (side + side % 2 for side in size)
@@ -70,7 +70,8 @@ def _loop_writer(name: str, tick: int, path: Path, size: tuple[int, int], fps: F
     Delays alternate between ticks of the format, milliseconds, so that the whole keeps its time. Over 50 pictures a
     second only every second, third, ... is kept. RequestError when it outgrows memory.
     """
-    image = _import_package("PIL.Image")
+    from PIL import Image
+
     stride, count, pictures = math.ceil(fps / _LOOP_FPS), 0, []
     most = _LOOP_PIXELS // (size[0] * size[1])
 
@@ -80,7 +81,7 @@ def _loop_writer(name: str, tick: int, path: Path, size: tuple[int, int], fps: F
             if len(pictures) == most:
                 found = f"a {name} of {size[0]}x{size[1]} can have {most} pictures"
                 raise RequestError(f"{found}; shrink it or write an MP4")
-            pictures.append(image.fromarray(picture))
+            pictures.append(Image.fromarray(picture))
         count += 1
 
     yield write
@@ -92,16 +93,10 @@ def _loop_writer(name: str, tick: int, path: Path, size: tuple[int, int], fps: F
 
 def save_png(path: Path, picture: Array) -> None:
     """Write one picture (height, width, 3) uint8, whole or not at all."""
-    image = _import_package("PIL.Image")
+    from PIL import Image
+
     with atomic.atomic_path(path) as scratch:
-        image.fromarray(picture).save(scratch, format="PNG", optimize=True)
-
-
-def _import_package(name: str):
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise RequestError(f"films need {name.split('.')[0]} ({error}): pip install 'mapctl[render]'") from error
+        Image.fromarray(picture).save(scratch, format="PNG", optimize=True)
 
 
 _GAP = 0.008

@@ -24,7 +24,7 @@ from controllers.steering.steer import Refusal, SteerFrames, SteerState, Stepper
 from mapctl.arguments import read_number
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
-from mapctl.intent.steering import Command, CommandTrack, SteeringTarget
+from mapctl.intent.steering import Command, CommandTrack
 from mapctl.metrics.travel import list_misses, measure_arrivals, measure_commands
 from mapctl.motion import Motion
 from mapctl.problem.solution import Ledger
@@ -148,11 +148,6 @@ class Recorder:
         arrivals = measure_arrivals(motion, track, [refusal.order for refusal in refusals])
         misses = [*(refusal.reason for refusal in refusals), *list_misses(commands, arrivals)]
         return {"commands": commands, "arrivals": arrivals, "misses": misses}
-
-    @property
-    def steering_targets(self) -> list[SteeringTarget]:
-        """Steering targets of all frames."""
-        return [target for piece in self.pieces for target in piece.steering_targets]
 
     @property
     def ledger(self) -> Ledger:

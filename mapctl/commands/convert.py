@@ -28,7 +28,7 @@ from mapctl.robots.retarget import RobotMotion, retarget_to_robot
 
 
 @dataclass(frozen=True)
-class Convert(Command, options.ReadOptions):
+class Convert(Command, options.ReadOptions, options.FolderOptions):
     """Write a motion, or a folder of them, in another format, on another skeleton or at another frame rate, or some
     frames of it; mirrored, with planted feet, as a loop, in place, or with its travel on the root joint.
 
@@ -91,11 +91,6 @@ class Convert(Command, options.ReadOptions):
     root_motion: bool = False
     """Put the travel, position on the ground and heading, on the root joint above the hips; one is added where the rig
     has none."""
-    jobs: options.Count = 1
-    """For a folder: number of files at once, each in a process of its own."""
-    again: bool = False
-    """For a folder: convert files again whose result exists already."""
-    quiet: options.Quiet = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,19 +260,9 @@ def run(command: Convert) -> int:
         if ending is not None and not conversion.to_robot:
             formats.check_ending(f"a{ending}")
         return folders.run_folder(
-            command.source,
-            command.out,
-            conversion,
-            label="converting",
-            done="converted",
-            again=command.again,
-            quiet=command.quiet,
-            processes=command.jobs,
-            ending=ending,
+            command.source, command.out, conversion, command, label="converting", done="converted", ending=ending
         )
-    for name, idle in (("to", command.to is None), ("again", not command.again), ("jobs", command.jobs == 1)):
-        if not idle:
-            raise RequestError(f"--{name} is for folders; {command.source} is a file")
+    folders.refuse_options(command, command.source, "to")
     conversion = Conversion.of(command)
     if not conversion.to_robot:
         formats.check_ending(command.out)

@@ -28,7 +28,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Denoise(ModelCommand, options.RigOptions):
+class Denoise(ModelCommand, options.RigOptions, options.FolderOptions):
     """Denoise a capture with noise, sliding and gaps, of any known rig: same skeleton, names, frames and rate."""
 
     source: Positional[Annotated[Path, arg(metavar="IN|FOLDER")]]
@@ -65,16 +65,11 @@ class Denoise(ModelCommand, options.RigOptions):
     """JSON with the faults found, corrections, contacts, ledger; of a folder, a folder of them."""
     video: options.MaybeFile = None
     """Film of the capture and the result side by side: .mp4, .gif, .webp or .png."""
-    jobs: options.Count = 1
-    """For a folder: number of files at once, each in a process of its own."""
     cluster: Annotated[str | None, arg(metavar="local|ADDRESS")] = None
     """For a folder: use a ray cluster instead; `local` starts one on this machine with --jobs workers."""
-    again: bool = False
-    """For a folder: denoise files again whose result exists already."""
     strict: bool = False
     """Exit with status 3 where not all that was requested holds: the network was out of its depth for more than half of
     the frames, or with --only-faults a fault is left."""
-    quiet: options.Quiet = False
 
     @property
     def settings(self) -> DenoiseSettings:
@@ -104,9 +99,7 @@ def run(command: Denoise) -> int:
         raise RequestError("--delay is how far --causal may look ahead; leave it out, or ask for both")
     if command.source.is_dir():
         return _run_folder(command)
-    for name, idle in (("cluster", command.cluster is None), ("again", not command.again), ("jobs", command.jobs == 1)):
-        if not idle:
-            raise RequestError(f"--{name} is for folders; {command.source} is a file")
+    folders.refuse_options(command, command.source, "cluster")
     results.check_destinations(command.out, command.video, command.report, given=(command.source,))
     rig = inputs.read_rig(command.rig, command)
     with outputs.show_progress("denoising", quiet=command.quiet) as progress:
@@ -225,11 +218,9 @@ def _run_folder(command: Denoise) -> int:
         command.source,
         command.out,
         FileDenoiser(named, inputs.read_rig(command.rig, command)),
+        command,
         label="denoising",
         done="denoised",
-        again=command.again,
-        quiet=command.quiet,
-        processes=command.jobs,
         cluster=command.cluster,
     )
 

@@ -3,9 +3,8 @@
 from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Annotated
 
-from tyro.conf import Positional, UseAppendAction, arg
+from tyro.conf import Positional
 
 import priors
 from mapctl import curves, formats
@@ -37,8 +36,7 @@ class FollowCurve(ModelCommand, options.ReadOptions, ShotOptions):
     rig: options.BodyRig = "canonical"
     keys: options.MaybeFile = None
     """TOML file of [[key]] tables: what hands and feet reach for, the head looks at, which pose is held, and when."""
-    avoid: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="X,Z,RADIUS")] = ()
-    """A disc on the ground to walk around, metres; may be given several times."""
+    avoid: options.Avoid = ()
     ground: options.MaybeFile = None
     """TOML file of the ground, where it is not flat: boxes, ramps, stairs or a grey picture as a height field."""
     variations: options.Count = 1

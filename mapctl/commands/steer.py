@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import torch
-from tyro.conf import Positional, UseAppendAction, arg
+from tyro.conf import Positional, arg
 
 import priors
 from controllers.common.character import Character
@@ -71,8 +71,7 @@ class Steer(ModelCommand, options.ReadOptions, streaming.StreamOptions):
     not given."""
     rig: options.BodyRig = "canonical"
     liveliness: options.Liveliness = steer.SteerSettings.liveliness
-    avoid: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="X,Z,RADIUS")] = ()
-    """A disc on the ground to walk around, metres; may be given several times."""
+    avoid: options.Avoid = ()
     ground: options.MaybeFile = None
     """TOML file of the ground, where it is not flat (see `mapctl follow --help`): feet are put onto it when the script
     has been played, so it goes without --stream."""

@@ -4,7 +4,7 @@ No file's failure stops another, and failures are listed at the end; a full disk
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from joblib import Parallel, delayed
 from mapctl import formats
 from mapctl.commands.shared import outputs
 from mapctl.commands.shared.command import NOT_SATISFIED
+from mapctl.commands.shared.options import FolderOptions
 from mapctl.errors import DiskFullError, MapctlError, RequestError
 
 Work = Callable[[Path, Path], tuple[int, float]]
@@ -31,26 +32,32 @@ class _Result:
     seconds: float = 0.0
 
 
+def refuse_options(options: FolderOptions, source: Path, *others: str) -> None:
+    """Raise RequestError where one of the options for folders, or of `others`, is given with a file."""
+    for field in fields(options):
+        if field.name in ("jobs", "again", *others) and getattr(options, field.name) != field.default:
+            raise RequestError(f"--{field.name} is for folders; {source} is a file")
+
+
 def run_folder(
     source: Path,
     out: Path,
     work: Work,
+    options: FolderOptions,
     *,
     label: str,
     done: str,
-    again: bool,
-    quiet: bool,
-    processes: int,
     ending: str | None = None,
     cluster: str | None = None,
 ) -> int:
-    """Do the work for every motion below a folder, in so many processes of this machine or on a `cluster`, and print
-    how many files are `done` (a word for it), at which cost, and which failed; return the exit status.
+    """Do the work for every motion below a folder, in processes of this machine or on a `cluster`, and print how many
+    files are `done` (a word for it), at which cost, and which failed; return the exit status.
 
     Results have the same names in sub-folders of the same names, with an `ending` if it is given, else their own or
-    .bvh; those that exist already are left out unless they are wanted `again`. RequestError where there is no motion,
+    .bvh; those that exist already are left out unless `options` want them again. RequestError where there is no motion,
     where two results would have one name, and where a result would be written over a motion that is there to be read.
     """
+    processes, again = options.jobs, options.again
     if processes < 1:
         raise RequestError(f"--jobs must be at least 1, got {processes}")
     jobs = _collect_jobs(source, out, ending)
@@ -64,14 +71,14 @@ def run_folder(
         ended: Any = Parallel(n_jobs=processes, return_as="generator_unordered")(delayed(run)(job) for job in left)
     results: list[_Result] = []
     counted = outputs.explain_progress(len(left), "files", "" if again else "the same command goes on with the others")
-    with outputs.show_progress(label, quiet=quiet) as progress, counted as finished:
+    with outputs.show_progress(label, quiet=options.quiet) as progress, counted as finished:
         for result in ended:
             results.append(result)
             finished(len(results))
             if progress is not None:
                 progress(len(results), len(left))
     failed = sorted((result for result in results if result.error), key=lambda result: result.source)
-    if not quiet:
+    if not options.quiet:
         frames, seconds = sum(result.frames for result in results), sum(result.seconds for result in results)
         cost = f", {1000 * seconds / frames:.1f} ms a frame" if frames else ""
         counts = f"{len(jobs) - len(left)} there already, {len(failed)} failed"

@@ -7,7 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
 from mapctl.errors import RequestError
 
@@ -22,6 +22,10 @@ Prior = Annotated[str, arg(metavar="NAME", help="A bundled prior, or the file or
 _LIVELINESS = "Variety of walks: 0 is the most probable one, smoother than people walk; 1 is as varied as the prior."
 Liveliness = Annotated[float, arg(metavar="0..1", help=_LIVELINESS)]
 Quiet = Annotated[bool, arg(help="No summary and no progress bar.")]
+Avoid = Annotated[
+    UseAppendAction[tuple[str, ...]],
+    arg(metavar="X,Z,RADIUS", help="A disc on the ground to walk around, metres; may be given several times."),
+]
 MaybeSpeed = Annotated[str | None, arg(metavar="M/S|ARC:M/S,...")]
 MaybeFile = Annotated[Path | None, arg(metavar="FILE")]
 MaybeCurve = Annotated[str | None, arg(metavar="CURVE")]
@@ -62,6 +66,17 @@ class RigOptions(ReadOptions):
 
     rig: MaybeRig = None
     """The rig of what is read, where it is not the one that would be recognised; see `mapctl info IN`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FolderOptions:
+    """Options for a folder in place of a file."""
+
+    jobs: Count = 1
+    """For a folder: number of files at once, each in a process of its own."""
+    again: bool = False
+    """For a folder: write files again whose result exists already."""
+    quiet: Quiet = False
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -229,7 +229,7 @@ class PlayedShot:
     def measures(self) -> Mapping[str, float]:
         """Measures of the motion against the trajectory that was planned."""
         planned, footing, motion = self.solution.trajectory, self.solution.footing, self.solution.motion
-        speed = float(planned.arcs[-1]) * float(motion.fps) / (motion.num_frames - 1)
+        speed = float(planned.arcs[-1]) / ((motion.num_frames - 1) / float(motion.fps))
         found = metrics.measure(motion, planned.curve, speed=speed)
         if footing is None:
             return found
