@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,6 +21,7 @@ from mapctl.errors import RequestError
 from mapctl.intent.steering import Command
 from mapctl.motion import Motion
 from mapctl.retarget.carry import retarget_motion
+from mapctl.streaming.messages import Endpoint
 from mapctl.terms import FootContact
 from priors import checkpoints
 from scenes.drawn_character import DrawnCharacter
@@ -62,14 +63,18 @@ def run(command: Live) -> int:
     """Check, open, serve until Ctrl-C; whatever was opened is closed, also where the rest cannot be."""
     _check(command)
     with ExitStack() as opened:
-        receiver = streaming.open_receiver(command.listen)
-        if receiver is not None:
-            opened.callback(receiver.close)
+        receiver = None
+        if command.listen is not None:
+            from mapctl.streaming.receiver import OscReceiver
+
+            receiver = opened.enter_context(closing(OscReceiver(Endpoint.parse(command.listen, option="--listen"))))
         show, stream = _open_app(command, receiver, opened)
         if not show.url.endswith(f":{command.port}"):
             print(f"port {command.port} is in use")
-        for line in streaming.describe(stream, receiver):
-            print(line)
+        if stream is not None:
+            print(f"poses go to {', '.join(map(str, stream.endpoints))} (VMC)")
+        if receiver is not None:
+            print(f"orders come from {receiver.endpoint} (OSC)")
         print(f"open {show.url} in a browser; Ctrl-C ends", flush=True)
         try:
             show.run()

@@ -45,18 +45,16 @@ def check(command: StreamOptions, listen: str | None = None, *, characters: int 
 
 def check_endpoints(stream: str | None, listen: str | None, *, characters: int = 1) -> None:
     """Raise RequestError for endpoints that cannot be, unknown hosts, ports that meet, or a missing package."""
-    targets, address = list[Endpoint](), ""
-    if stream is not None:
-        first = Endpoint.parse(stream, option=_STREAM)
-        targets = [first.offset(k, option=_STREAM) for k in range(characters)]
-        address = first.resolve(option=_STREAM)[1]
-    if listen is not None:
-        source = Endpoint.parse(listen, option=_LISTEN)
-        here = (source.resolve(option=_LISTEN)[1], LOOPBACK, "::1") if targets else ()
-        if any(source.port == target.port and address in here for target in targets):
-            raise RequestError(f"{_LISTEN} {source} is where {_STREAM} sends poses to; choose another port")
     if (stream or listen) and find_spec("pythonosc") is None:
         raise RequestError("streaming needs the package python-osc: pip install 'mapctl[stream]'")
+    source = None if listen is None else Endpoint.parse(listen, option=_LISTEN)
+    if stream is None:
+        return
+    first = Endpoint.parse(stream, option=_STREAM)
+    last, (_, address) = first.offset(characters - 1, option=_STREAM), first.resolve(option=_STREAM)
+    meet = source is not None and first.port <= source.port <= last.port
+    if source and meet and address in (source.resolve(option=_LISTEN)[1], LOOPBACK, "::1"):
+        raise RequestError(f"{_LISTEN} {source} is where {_STREAM} sends poses to; choose another port")
 
 
 def open_stream(command: StreamOptions, skeletons: Sequence[Skeleton]) -> "PoseStream | None":
@@ -67,15 +65,6 @@ def open_stream(command: StreamOptions, skeletons: Sequence[Skeleton]) -> "PoseS
 
     to = Endpoint.parse(command.stream, option=_STREAM)
     return PoseStream(to, skeletons, root_travels=command.stream_root, delay=command.stream_delay)
-
-
-def open_receiver(text: str | None) -> "OscReceiver | None":
-    """Open the source of orders; None where none is requested. RequestError where its port is taken."""
-    if text is None:
-        return None
-    from mapctl.streaming.receiver import OscReceiver
-
-    return OscReceiver(Endpoint.parse(text, option=_LISTEN))
 
 
 @contextmanager
@@ -101,14 +90,6 @@ def open_relay(
             yield receiver, send
     if not quiet:
         print(f"\n{receiver.dropped} packets were not understood{receiver.fault and f' ({receiver.fault})'}")
-
-
-def describe(stream: "PoseStream | None", receiver: "OscReceiver | None") -> Iterator[str]:
-    """Yield a line each on where poses go and where orders come from."""
-    if stream is not None:
-        yield f"poses go to {', '.join(map(str, stream.endpoints))} (VMC)"
-    if receiver is not None:
-        yield f"orders come from {receiver.endpoint} (OSC)"
 
 
 def summarise(stream: "PoseStream") -> str:
