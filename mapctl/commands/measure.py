@@ -1,9 +1,10 @@
 """`mapctl measure`: the measures of a motion, or of a folder of them, beside those of a reference and of mocap."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from statistics import fmean
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -116,19 +117,10 @@ class _ClipSet:
     notes: list[str]
     """Notes on measures that could not be made comparable."""
 
-    @property
-    def means(self) -> dict[str, float]:
-        """Mean of each measure over the clips that can give it."""
-        names, rows = self.measures[0], self.measures
-        return {name: float(torch.tensor([row[name] for row in rows], dtype=torch.float64).nanmean()) for name in names}
-
-    @property
-    def largest(self) -> dict[str, float]:
-        """Largest value of each measure among the clips that can give it."""
-        return {
-            name: max((row[name] for row in self.measures if row[name] == row[name]), default=math.nan)
-            for name in self.measures[0]
-        }
+    def summarise(self, summary: Callable[[Sequence[float]], float]) -> dict[str, float]:
+        """Summarise each measure over the clips that can give it; NaN where none can."""
+        known = {name: [row[name] for row in self.measures if row[name] == row[name]] for name in self.measures[0]}
+        return {name: summary(values) if values else math.nan for name, values in known.items()}
 
     @staticmethod
     def read(folder: Path, *, with_windows: bool, rig: Rig | None = None) -> "_ClipSet":
@@ -170,8 +162,8 @@ def _measure_folders(command: Measure) -> dict[str, Any]:
     values: dict[str, Any] = {
         "clip": str(command.clip),
         "clips": len(ours.measures),
-        "measures": ours.means,
-        "largest": ours.largest,
+        "measures": ours.summarise(fmean),
+        "largest": ours.summarise(max),
         "reference": {},
         "mocap": _read_mocap_values(),
         "notes": ours.notes,
@@ -186,7 +178,7 @@ def _measure_folders(command: Measure) -> dict[str, Any]:
             ours.windows, reference.windows, generator=generator, settings=SETTINGS, progress=progress
         )
     return values | {
-        "reference": reference.means,
+        "reference": reference.summarise(fmean),
         "notes": ours.notes + reference.notes,
         "skipped": ours.skipped | reference.skipped,
         "reference_clips": len(reference.measures),
