@@ -98,7 +98,7 @@ class DrawnCharacter:
 
         def retarget(part: Motion) -> tuple[Motion, Motion, tuple[str, ...]]:
             done = retarget_canonical(to_canonical(part, as_rig(source.rigmap))[0], source, self.body)
-            return self.body.on_rig(done.motion), done.motion, done.notes
+            return self.body.on_rig(done.motion), done.motion, done.changes.notes
 
         return retarget
 

@@ -92,7 +92,7 @@ def blend(
     done = fill(transferred, missing, inbetweener, **options)
     margins = (there.start, there.start - free.start), (there.stop - 1, free.stop - there.stop)
     infeasible = _note_infeasible_margins(transfer, distances, margins, fps)
-    status = done.status.with_notes(retargeted.notes).with_notes(infeasible, infeasible=bool(infeasible))
+    status = done.status.with_notes(retargeted.changes.notes).with_notes(infeasible, infeasible=bool(infeasible))
     status = status.with_notes([f"frames {free.start}:{free.stop} of {', '.join(transfer.limbs)} are new"])
     return replace(done, missing=MissingMask(new_or_margin[:, None] & moved, nothing), status=status)
 

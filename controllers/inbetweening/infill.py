@@ -143,7 +143,7 @@ def chain(
     masks: list[Mask] = []
     for clip in clips:
         retargeted = retarget_motion(clip, body, rig)
-        notes += retargeted.notes
+        notes += retargeted.changes.notes
         motion = retargeted.motion.resample(PRIOR_FPS)
         count = min(piece, motion.num_frames)
         start = (motion.num_frames - count) // 2

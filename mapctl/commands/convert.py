@@ -103,8 +103,6 @@ class Converted:
     """Edits applied, one sentence each."""
     changes: Changes | None
     """Changes in retargeting to another rig."""
-    notes: tuple[str, ...]
-    """The same in sentences, as far as it is worth one."""
     robot: RobotMotion | None = None
     """The motion of the robot that it was retargeted to."""
 
@@ -152,7 +150,7 @@ class Conversion:
         return self.robot is not None and self.command.as_ is None and ending in robot_files.ENDINGS
 
     def convert(self, source: Path) -> Converted:
-        command, rig, notes = self.command, self.source_rig, list[str]()
+        command, rig = self.command, self.source_rig
         may_lack = source.suffix.lower() in formats.MAY_LACK_RATE
         fps_in = self.fps_in if may_lack or not command.source.is_dir() else None
         if self.robot is not None and source.suffix.lower() == ".csv":
@@ -177,8 +175,7 @@ class Conversion:
             found = retarget_motion(motion, self.body, rig, ground=command.ground)
             original = motion if motion.skeleton.matches(self.body.rigmap.rig_skeleton) else None
             motion = self.body.on_rig(found.motion, original=original, fingers=found.fingers)
-            rig, changes, notes = as_rig(self.body.rigmap), found.changes, list(found.notes)
-            lines = [f"note: {note}" for note in notes]
+            rig, changes = as_rig(self.body.rigmap), found.changes
         if self.fps is not None:
             motion = motion.resample(self.fps)
         if command.mirror:
@@ -200,10 +197,10 @@ class Conversion:
         if ending == "vrma" and not getattr(motion.source, "humanoid", None):  # no other rig is one that it names
             motion = retarget.to_canonical(motion, rig)[0]
         if not self.to_robot:
-            return Converted(motion, tuple(lines), changes, tuple(notes))
+            return Converted(motion, tuple(lines), changes)
         assert self.robot is not None
         robot, changes = retarget_to_robot(motion, self.robot, rig)
-        return Converted(motion, tuple(lines), changes, tuple(notes), robot)
+        return Converted(motion, tuple(lines), changes, robot)
 
     def save(self, done: Converted, out: Path) -> None:
         """Write a converted motion."""
@@ -272,7 +269,7 @@ def run(command: Convert) -> int:
     seconds = [] if done.robot is None else plausibility.assess(done.robot)
     if command.report is not None and done.changes is not None:
         request = options.describe_request("convert", command)
-        changes = asdict(done.changes) | {"notes": list(done.notes)}
+        changes = asdict(done.changes) | {"notes": list(done.changes.notes)}
         found = {"mapctl": __version__, "request": request, "changes": changes}
         if seconds:
             found["seconds"] = [asdict(second) for second in seconds]
@@ -281,6 +278,7 @@ def run(command: Convert) -> int:
         rate = f"{float(done.motion.fps):.6g} frames a second"
         joints = done.motion.num_joints if done.robot is None else len(done.robot.robot.joints)
         size = f"{done.motion.num_frames} frames, {joints} joints"
-        lines = [f"{command.out}: {size}, {rate}", *done.lines]
+        notes = [] if done.changes is None else [f"note: {note}" for note in done.changes.notes]
+        lines = [f"{command.out}: {size}, {rate}", *notes, *done.lines]
         print("\n".join([*lines, _describe_robot(seconds)] if seconds else lines))
     return 0

@@ -85,6 +85,25 @@ class Changes:
     unmatched_joints: tuple[str, ...] = ()
     """Joints of the source that move and have no counterpart."""
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Return sentences about what could not be kept; empty where all is."""
+        found = [
+            f"the {name} are too short for some of it: {ends} are up to {100 * miss.metres:.1f} cm off (frame"
+            f" {miss.frame}), by more than {100 * noted:g} cm in {miss.frames} frames"
+            for name, ends, miss, noted in (
+                ("legs", "feet", self.feet_missed, _FOOT_METRES),
+                ("arms", "hands", self.hands_missed, _HAND_METRES),
+            )
+            if miss.frames
+        ]
+        if self.hips_lowered_m >= _DIP_METRES:
+            dip = f"{100 * self.hips_lowered_m:.1f} cm"
+            found.append(f"the hips are up to {dip} lower than in scale, so that the feet reach")
+        if self.unmatched_joints:
+            found.append(f"joints without a counterpart are left out: {abbreviate_names(self.unmatched_joints)}")
+        return tuple(found)
+
 
 @dataclass(frozen=True, eq=False)
 class RetargetedMotion:
@@ -95,26 +114,6 @@ class RetargetedMotion:
     changes: Changes = Changes()
     fingers: Mapping[int, Float[Tensor, "frames 4"]] = field(default_factory=dict)
     """Local rotations (xyzw) of the body's finger joints that turn as the source's, by joint of its rig."""
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Return sentences about what could not be kept; empty where all is."""
-        changes = self.changes
-        found = [
-            f"the {name} are too short for some of it: {ends} are up to {100 * miss.metres:.1f} cm off (frame"
-            f" {miss.frame}), by more than {100 * noted:g} cm in {miss.frames} frames"
-            for name, ends, miss, noted in (
-                ("legs", "feet", changes.feet_missed, _FOOT_METRES),
-                ("arms", "hands", changes.hands_missed, _HAND_METRES),
-            )
-            if miss.frames
-        ]
-        if changes.hips_lowered_m >= _DIP_METRES:
-            dip = f"{100 * changes.hips_lowered_m:.1f} cm"
-            found.append(f"the hips are up to {dip} lower than in scale, so that the feet reach")
-        if changes.unmatched_joints:
-            found.append(f"joints without a counterpart are left out: {abbreviate_names(changes.unmatched_joints)}")
-        return tuple(found)
 
 
 _SMOOTH_SECONDS = 0.05  # seconds over which what hips carry is smoothed

@@ -63,7 +63,7 @@ def foot_pitch_deg(motion: Motion) -> torch.Tensor:
 def test_a_retargeted_walker_stands_as_in_the_source(source, body, fps):
     clip, own = performer(source).walks(90 * fps // 30, fps), performer(body).walks()
     done = retarget_motion(clip, RiggedCharacter.of(own)[1])
-    assert done.notes == ()
+    assert done.changes.notes == ()
     torch.testing.assert_close(low_toes(done.motion), low_toes(own), atol=0.008, rtol=0)
     torch.testing.assert_close(foot_pitch_deg(done.motion), foot_pitch_deg(own), atol=1.5, rtol=0)
     assert planted_speed(done.motion) < 1.15 * planted_speed(clip) + 0.01
@@ -133,7 +133,7 @@ def test_a_kick_is_the_same_pose():
     clip = USUAL.stands(turned={HIPJOINTS[0]: -1.6 * up})
     for body in (PEOPLE["short legs"], replace(PEOPLE["long flat foot"], thighs_drop=0.12)):
         done = retarget_motion(clip, RiggedCharacter.of(body.walks())[1])
-        assert done.notes == ()
+        assert done.changes.notes == ()
         ways = [m.joint_positions()[30, FEET[0]] - m.joint_positions()[30, HIPJOINTS[0]] for m in (clip, done.motion)]
         assert float(torch.nn.functional.cosine_similarity(*ways, dim=0)) > math.cos(math.radians(1))
 
@@ -201,7 +201,7 @@ def test_numbers_of_a_walk():
     assert found.changes.scale == pytest.approx(1.25)
     assert found.changes.hips_lowered_m < 0.01
     assert found.changes.feet_missed.frames == found.changes.hands_missed.frames == 0
-    assert found.changes.unmatched_joints == found.notes == ()
+    assert found.changes.unmatched_joints == found.changes.notes == ()
 
 
 def test_joints_that_move_and_have_no_counterpart_are_named():

@@ -82,7 +82,7 @@ def test_a_hand_is_where_it_was_on_the_body(pose, name):
     size = size_of(name)
     before, after = (palms(m, s)[:, 1] - m.joint_positions()[:, anchor] for m, s in ((clip, 1.0), (done.motion, size)))
     assert float((after - size * before).norm(dim=-1).max()) < 0.015
-    assert not [note for note in done.notes if "hands" in note]
+    assert not [note for note in done.changes.notes if "hands" in note]
 
 
 def clapping(frames: int = 90) -> Motion:
@@ -162,7 +162,7 @@ def test_arms_that_are_too_short_get_as_near_as_they_can_and_say_so():
     share = ease(90, 15, 40) * (1 - ease(90, 50, 75))
     clip = at_hip(arms_down(standing(90)), share=share)
     done = retarget_motion(clip, body_of(bones(arms=0.55)))
-    given = [note for note in done.notes if note.startswith("the arms are too short")]
+    given = [note for note in done.changes.notes if note.startswith("the arms are too short")]
     assert len(given) == 1
     assert "cm off (frame " in given[0]
     miss = done.changes.hands_missed
