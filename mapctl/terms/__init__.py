@@ -1,7 +1,7 @@
 """The terms of the MAP problem. A new one is a file here, a name below and an instance in tests/catalogue.py."""
 
 from mapctl.terms.base import Term
-from mapctl.terms.foot_contact import Clearance, FootContact, LandingSigmas, Support
+from mapctl.terms.foot_contact import Clearance, FootContact, LandingSigmas
 from mapctl.terms.jerk import Jerk
 from mapctl.terms.likelihood import LatentPrior, Likelihood
 from mapctl.terms.motion_tracking import MotionTracking
@@ -24,7 +24,6 @@ __all__ = [
     "Path",
     "RootVelocity",
     "StepLength",
-    "Support",
     "Term",
     "Trial",
     "WithinReach",

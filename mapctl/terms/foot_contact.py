@@ -1,5 +1,5 @@
 """Feet: planted toes and heels do not move and are on the ground (Wang et al. 2019, Eq. 18), and land without a snap;
-toes that travel clear the ground; the toe that supports the body does not move, whatever the contact bits.
+toes that travel clear the ground.
 """
 
 import math
@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl.contacts import support_speed
 from mapctl.skeleton import TOE_REST_HEIGHT, find_heel_drops
 from mapctl.terms.base import TrialGradient
 from mapctl.terms.trial import Trial
@@ -217,23 +216,3 @@ class Clearance:
             wanted = wanted * self.share.to(wanted)
         lacking = wanted - (trial.toe_heights - self.rest_height)
         return torch.where(trial.contacts, 0.0, lacking.clamp_min(0))
-
-
-@dataclass(frozen=True, eq=False)
-class Support:
-    """The slowest of the toes near the ground, which supports the body, does not travel; flight costs nothing."""
-
-    sigma: float = 0.1
-    """Standard deviation of that toe's speed over the ground, m/s; mocap's planted toes move at 0.05."""
-    rest_height: float | Float[Tensor, "frames 2"] = TOE_REST_HEIGHT
-    """Height of the toe joint while the foot is flat on the ground, metres; of each toe's in each frame, if not one."""
-    name: str = "support"
-    unit: str = "m/s"
-
-    def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Return the energies, nats."""
-        return 0.5 * (self.residual(trial) / self.sigma).square()
-
-    def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Return the speed of the supporting toe over the ground, m/s; 0 in flight."""
-        return support_speed(trial.toe_heights - self.rest_height, trial.toe_speeds)
