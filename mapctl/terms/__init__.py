@@ -2,11 +2,10 @@
 
 from mapctl.terms.base import Term
 from mapctl.terms.foot_contact import Clearance, FootContact, LandingSigmas
-from mapctl.terms.jerk import Jerk
 from mapctl.terms.likelihood import LatentPrior, Likelihood
 from mapctl.terms.motion_tracking import MotionTracking
 from mapctl.terms.path import Path
-from mapctl.terms.positions import KeepApart, KeepClear, Keyframe, WithinReach
+from mapctl.terms.positions import Jerk, KeepApart, KeepClear, Keyframe, WithinReach
 from mapctl.terms.steering import RootVelocity, StepLength
 from mapctl.terms.trial import Trial
 
