@@ -7,7 +7,7 @@ from enum import Enum
 from typing import Any
 
 import numpy as np
-import scipy
+import scipy  # pyright: ignore[reportMissingTypeStubs]
 import torch
 from jaxtyping import Float
 from numpy import ndarray
