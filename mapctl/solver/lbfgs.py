@@ -7,15 +7,16 @@ from enum import Enum
 from typing import Any
 
 import numpy as np
-import scipy  # pyright: ignore[reportMissingTypeStubs]
 import torch
 from jaxtyping import Float
 from numpy import ndarray
+from scipy import optimize  # pyright: ignore[reportMissingTypeStubs]
 from torch import Tensor
 
 from mapctl.errors import RequestError
 from mapctl.solver.budget import Meter
 
+_minimize: Any = optimize.minimize  # pyright: ignore[reportUnknownMemberType]
 _MEMORY, _TRIALS = 10, 12  # curvature pairs that are kept, and trial steps in one line search
 _LARGEST_SLOPE = 1e-3  # entry of a gradient from which on a point is no minimum, energy per unit of the unknowns
 _REFUSED = 1e3  # energy of a point that is not finite, over that of the start: the line search turns back there
@@ -129,9 +130,7 @@ def minimise(
     }
     start = x.detach().to("cpu", torch.float64).flatten().numpy()
     try:
-        found: Any = scipy.optimize.minimize(
-            search.evaluate, start, jac=True, method="L-BFGS-B", callback=search.accept, options=options
-        )
+        found = _minimize(search.evaluate, start, jac=True, method="L-BFGS-B", callback=search.accept, options=options)
         status = LbfgsStatus(_ENDS[found.status])
     except _Ended as ended:
         status = ended.status
