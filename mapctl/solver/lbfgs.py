@@ -16,7 +16,7 @@ from torch import Tensor
 from mapctl.errors import RequestError
 from mapctl.solver.budget import Meter
 
-_minimize: Any = optimize.minimize  # pyright: ignore[reportUnknownMemberType]
+_minimize: Any = optimize.minimize  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
 _MEMORY, _TRIALS = 10, 12  # curvature pairs that are kept, and trial steps in one line search
 _LARGEST_SLOPE = 1e-3  # entry of a gradient from which on a point is no minimum, energy per unit of the unknowns
 _REFUSED = 1e3  # energy of a point that is not finite, over that of the start: the line search turns back there
