@@ -41,7 +41,6 @@ from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, mirror_featur
 from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.query import INTERPOLATION, GapSource
 from mapctl.kinematics import forward_kinematics, heading
-from mapctl.kinematics.fast import place_joints
 from mapctl.motion import Motion
 from mapctl.numerics.gaussian import averaging_matrix
 from mapctl.numerics.intervals import true_intervals
@@ -553,10 +552,7 @@ class Sides:
 
     def place_joints(self) -> Float[Tensor, "sides batch generated joints 3"]:
         """Place the joints, metres, seen from the first end."""
-        shape = self.features.shape[:2]
-        return place_joints(
-            self.features.flatten(0, 1), self.position.flatten(0, 1), self.heading.flatten(0, 1), CANONICAL
-        ).unflatten(0, shape)
+        return BodyPose.of_features_at(self.features, self.position, self.heading).joints_world()
 
 
 def count_generated(frames: int) -> int:

@@ -42,7 +42,6 @@ from mapctl.terms import (
     Path,
     RootVelocity,
     StepLength,
-    Support,
     Term,
     WithinReach,
 )
@@ -78,7 +77,6 @@ TERMS: dict[str, Term] = {
     "footing of heels": FootContact(9.0, 9.0, 9.0, heels=HeelSigmas(0.2, 0.05, 0.02, doubt=3.0)),
     "footing on supports": FootContact(supports=torch.linspace(0, 0.3, 2 * FRAMES).view(FRAMES, 2)),
     "steps": StepLength(0.6),
-    "support": Support(rest_height=0.08),
     "clearance": Clearance(height=0.2, share=torch.linspace(0.5, 1, 2 * FRAMES).view(FRAMES, 2)),
     "seam": Jerk(sigma=300.0),
     "closeness": MotionTracking(encode(walk(30, cadence=1.1, seed=4))[0][8 : 8 + FRAMES], sigma_heading=0.3),

@@ -48,7 +48,7 @@ _SIGMA_RANGE_DEG = 3.0  # degrees of a joint's turn beyond its range
 _SIGMA_SIZE = 0.03  # share by which a drawing is larger than its bones let it be
 _TURNS = 8  # headings, evenly around, from which the search sets out
 _SIGMA_HEADING_DEG = 45.0  # degrees from the proposed heading, by which an answer is chosen where keys tell a heading
-_SEARCH = LbfgsSettings(max_iterations=80, relative_energy_tolerance=1e-5)
+_SEARCH = LbfgsSettings(max_iterations=160, relative_energy_tolerance=1e-5)
 
 
 def fit_drawings(motion: Motion, loose: LooseKeys, *, faced: bool) -> Motion:
@@ -115,7 +115,7 @@ def _fit(
     turn = found.x[:, :-1].unflatten(1, (joints, 3))
     quats = rotations.multiply(start, rotations.from_rotation_vector(turn))
     away = torch.rad2deg(rotations.wrap_angle(heading(quats[:, 0]) - heading(proposed[:1])))
-    energy = found.energy + (0.5 * (away / _SIGMA_HEADING_DEG).square() if faced else 0.0)
+    energy = energies(found.x) + (0.5 * (away / _SIGMA_HEADING_DEG).square() if faced else 0.0)
     return quats[int(energy.argmin())]
 
 

@@ -23,7 +23,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controllers.common.character import Character
-from controllers.common.map_refinement import estimate_rest_height
 from controllers.shots.walk import FollowSettings, walk_arcs
 from mapctl import contacts, curves, rotations
 from mapctl.curves import Curve
@@ -38,7 +37,7 @@ from mapctl.kinematics import heading
 from mapctl.metrics.body import measure_path_length, measure_peaks
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
-from mapctl.numerics.intervals import fill_missing, last_observed, next_observed, true_intervals
+from mapctl.numerics.intervals import last_observed, next_observed
 from mapctl.numerics.smooth_offsets import interpolate_offsets, interpolate_turns
 from mapctl.pose import decode
 from mapctl.problem import density_selection
@@ -403,43 +402,6 @@ def _find_arcs(curve: Curve, positions: Float[Tensor, "positions 2"]) -> Float[T
     return torch.tensor([*found, curve.length], dtype=torch.float64)
 
 
-_TOES = list(TOE_JOINTS)
-_STANCE_FADE_SECONDS = 0.12  # over which a swinging foot's correction fades away from its contacts
-
-
-def hold_planted(
-    motion: Motion,
-    planted: Bool[Tensor, "frames 2"],
-    *,
-    free: Bool[Tensor, " frames"],
-    rest_height: Float[Tensor, "frames 2"],
-) -> Motion:
-    """Hold the toes (left, right) of a canonical motion at one position during each contact, in frames that are free.
-
-    A contact that begins or ends in frames that are not free keeps its position there; others are held at the mean of
-    their positions, at `rest_height` (metres). Between contacts the correction fades. Hips and the feet's orientations
-    stay.
-    """
-    positions, goals = motion.joint_positions(), motion.joint_positions().clone()
-    for foot, toe in enumerate(_TOES):
-        offset = torch.zeros_like(positions[:, toe])
-        for _, start, stop in true_intervals(planted[:, foot, None]):
-            part, anchored = slice(start, stop), ~free[start:stop]
-            stance = positions[part, toe]
-            if bool(anchored.any()):
-                held = fill_missing(stance[None], anchored[None])[0]
-            else:
-                held = stance.mean(dim=0)
-                held[1] = rest_height[part, foot].mean()
-            offset[part] = held - stance
-        firm = ~free | planted[:, foot]
-        goals[:, CANONICAL.parents[toe]] += interpolate_offsets(
-            offset, firm, seconds=_STANCE_FADE_SECONDS, fps=float(motion.fps)
-        )
-    turning = free[:, None].expand(-1, CANONICAL.num_joints)
-    return bend_limbs(motion, motion, goals, torch.zeros_like(turning), turning)
-
-
 _PAST_FRAMES = 3  # frames before a gap that terms look back on
 
 
@@ -605,8 +567,8 @@ class RolloutInbetweener(Inbetweener):
         gap: tuple[int, int],
         generator: torch.Generator,
     ) -> tuple[Motion, Float[Tensor, "frames 2"]]:
-        """Roll through a gap to all joints in the known frames after it, and to effector targets within it; planted
-        toes, which the correction at arrival moves, are then held. Also return the contact logits."""
+        """Roll through a gap to all joints in the known frames after it, and to effector targets within it; also
+        return the contact logits."""
         start, stop = gap
         part = slice(start, stop + self.ahead)
         known = ~query.nothing_known[part]
@@ -626,10 +588,7 @@ class RolloutInbetweener(Inbetweener):
             frames,
             generator=generator,
         )
-        body, logits = insert_rollout(body, logits, window, committed.ground_pose, gap)
-        planted, free = contacts.debounced(logits > 0), torch.zeros(len(logits), dtype=torch.bool)
-        free[start:stop] = True
-        return hold_planted(body, planted, free=free, rest_height=estimate_rest_height(body, planted)), logits
+        return insert_rollout(body, logits, window, committed.ground_pose, gap)
 
 
 def _measure_largest_step(body: Motion) -> float:

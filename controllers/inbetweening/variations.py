@@ -4,11 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool
-from torch import Tensor
 
-from controllers.common.map_refinement import estimate_rest_height
-from controllers.inbetweening.pipeline import INFILL_REFINEMENT, InbetweenSolution
+from controllers.inbetweening.pipeline import InbetweenSolution
 from controllers.inbetweening.proposers import (
     EVERY_ROLLOUT_JUMPED,
     ROLLOUT_SPAN,
@@ -16,61 +13,11 @@ from controllers.inbetweening.proposers import (
     select_likeliest_density,
 )
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root
+from mapctl.features import PRIOR_FPS
 from mapctl.metrics.realism import Diversity, measure_diversity
-from mapctl.motion import Motion
-from mapctl.problem import density_selection
-from mapctl.problem.objective import Objective
-from mapctl.problem.receding_horizon import replay
-from mapctl.problem.solution import Ledger
-from mapctl.protocols import Density, Inbetweener
+from mapctl.problem.density_selection import proposal_sigma, select_density_for_motion
+from mapctl.protocols import Inbetweener
 from mapctl.retarget import to_canonical
-from mapctl.retarget.rigs import Rig
-from mapctl.terms import Likelihood, Support, Term
-from mapctl.terms.trial import Trial
-
-_PRECEDING_FRAMES = 3  # frames before those that are scored, on which terms look back
-
-
-def score(motion: Motion, contacts: Bool[Tensor, "frames 2"], density: Density, rig: Rig) -> Ledger:
-    """Compute the energy by term (likelihood under a density, contact, clearance, support, jerk) of a motion on any rig
-    of more than three frames at the prior's rate; `contacts` are its contacts at that rate."""
-    canonical = to_canonical(motion, rig)[0].resample(PRIOR_FPS)
-    bits = contacts[: canonical.num_frames]
-    features, before = encode(canonical)
-    features[: len(bits), LAYOUT.slices["contacts"]] = bits.to(features)
-    features = features.float()
-    ground, heading = integrate_root(features.double(), before)
-    ground_pose = GroundPose(ground[_PRECEDING_FRAMES - 1].float(), heading[_PRECEDING_FRAMES - 1].float())
-    shown = features[None, _PRECEDING_FRAMES:]
-    blurred = density.with_observation_noise(density_selection.proposal_sigma())
-    state = replay(blurred, features[:_PRECEDING_FRAMES], blurred.infer_state(features))
-    with torch.no_grad():
-        log_density = blurred.log_prob(shown, state)
-    height = estimate_rest_height(canonical, bits)[_PRECEDING_FRAMES:]
-    clearance, jerk = INFILL_REFINEMENT.clearance, INFILL_REFINEMENT.jerk
-    assert clearance is not None
-    assert jerk is not None
-    terms: list[Term] = [
-        Likelihood(INFILL_REFINEMENT.temperature),
-        replace(INFILL_REFINEMENT.footing, supports=height),
-        replace(clearance, rest_height=height),
-        Support(rest_height=height),
-        jerk,
-    ]
-    planted = features[:, LAYOUT.slices["contacts"]] > 0.5
-    trial = Trial(
-        shown,
-        ground_pose,
-        contacts=planted[None, _PRECEDING_FRAMES:],
-        log_density=log_density,
-        before=canonical.joint_positions()[:_PRECEDING_FRAMES].float(),
-        contacts_before=planted[_PRECEDING_FRAMES - 1],
-        skeleton=canonical.skeleton,
-        first_frame=_PRECEDING_FRAMES,
-    )
-    return Objective(lambda unknowns: trial, terms).build_ledger(trial)
-
 
 MAX_VARIATIONS = 1000
 """Most variations in one call."""
@@ -96,13 +43,8 @@ class Variation:
 
     solution: InbetweenSolution
     """Solution of in-betweening."""
-    ledger: Ledger
-    """Energy of the refined motion by term: likelihood, footing, clearance, support and jerk."""
-
-    @property
-    def energy(self) -> float:
-        """Mean energy of a frame, nats: less is likelier."""
-        return sum(float(entry.energy.mean()) for entry in self.ledger.entries)
+    energy: float
+    """Minus the mean log density of a frame, nats, physical units: less is likelier."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,5 +92,8 @@ def sample_variations(
         jumped = any(gap.reason == EVERY_ROLLOUT_JUMPED for other in found[1:] for gap in other.sources)
         cause = f"{EVERY_ROLLOUT_JUMPED} between these keys" if jumped else f"no two keys have {source.room}"
         raise RequestError(f"{cause}, which leaves nothing to vary")
-    each = (Variation(one, score(one.motion, one.contacts, density, one.rig)) for one in found)
+    blurred = density.with_observation_noise(proposal_sigma())
+    canonical = [to_canonical(one.motion, one.rig)[0] for one in found]
+    nats = [select_density_for_motion([blurred], motion).nats[blurred.name] for motion in canonical]
+    each = (Variation(one, -density) for one, density in zip(found, nats, strict=True))
     return Variations(tuple(each), measure_diversity([one.motion for one in found]))

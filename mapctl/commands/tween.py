@@ -203,7 +203,7 @@ def _run_variations(
         styles = [by for by in dict.fromkeys(part.by for part in solution.sources) if _IN_STYLE in by]
         if command.report is not None:
             errors = measure_keyframe_errors(motion, clip.motion, clip.keys, clip.rig)
-            own = {"file": str(file), "energy_nats": one.energy, "energy": one.ledger.summary(), "keys": errors}
+            own = {"file": str(file), "energy_nats": one.energy, "keys": errors}
             rows.append(own | results.build_report("tween", command, solution))
         if command.video is not None:
             name = styles[0].partition(_IN_STYLE)[2] if styles else file.stem

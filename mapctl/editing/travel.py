@@ -180,7 +180,7 @@ def _find_travel(
                 around = torch.cat([steps.flip(0), steps]).repeat(-(-side // (2 * len(steps))), 1)
                 ends.append(values[-1] + around[:side].cumsum(dim=0))
             padded = torch.cat([ends[0].flip(0), both, ends[1]])
-            both = gaussian.convolve(padded, gaussian.kernel(max(sigma, 1e-6), side), "repeated")[side:-side]
+            both = gaussian.smooth(padded, sigma, side=side)[side:-side]
         return both[:, :2], both[:, 2]
     shares = torch.arange(len(hips), dtype=torch.float64) / len(hips)
     turns, shifts = cycle.share(shares)

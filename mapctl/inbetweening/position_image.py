@@ -187,8 +187,8 @@ def _remove_jitter(positions: Float[Tensor, "1 frames joints 3"], image: Positio
     """Smooth a network's changes over about a frame, since the errors of its frames are independent. Where the changes
     are tiny they are jitter, and fade to the interpolation; known positions stay."""
     change = (positions - image.positions)[0]
-    smooth = gaussian.convolve(change, gaussian.kernel(_JITTER_SIGMA, 3), "repeated")
-    power = gaussian.convolve(smooth.square().sum(dim=-1), gaussian.kernel(_POWER_SIGMA, 3 * _POWER_SIGMA), "repeated")
+    smooth = gaussian.smooth(change, _JITTER_SIGMA, side=3)
+    power = gaussian.smooth(smooth.square().sum(dim=-1), _POWER_SIGMA)
     smooth = smooth * (power / (power + _MIN_CHANGE**2))[..., None]
     return torch.where(image.known[..., None], positions, image.positions + smooth)
 
@@ -198,7 +198,8 @@ def _estimate_root_drift(
 ) -> Float[Tensor, "frames 3"]:
     """Estimate the drift of the hips over the ground, without their sway; none where they are known."""
     offset = torch.where(missing[:, None], offset, 0.0) * torch.tensor([1.0, 0.0, 1.0], dtype=offset.dtype)
-    slow, taps = torch.zeros_like(offset), gaussian.kernel(_SWAY_SIGMA, 4 * _SWAY_SIGMA)
+    slow = torch.zeros_like(offset)
     for _ in range(_DRIFT_PASSES):  # each takes the slow part of the remainder
-        slow = slow + torch.where(missing[:, None], gaussian.convolve(offset - slow, taps, "repeated"), 0.0)
+        rest = gaussian.smooth(offset - slow, _SWAY_SIGMA, side=4 * _SWAY_SIGMA)
+        slow = slow + torch.where(missing[:, None], rest, 0.0)
     return slow

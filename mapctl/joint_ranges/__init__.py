@@ -70,29 +70,21 @@ class OutOfRange:
     """Frame in which it is farthest beyond."""
     degrees: float
     """By how much it is beyond there."""
-    frames: int
-    """Number of frames in which it is beyond."""
 
 
-def outside(
-    motion: Motion, ranges: JointRanges | None = None, *, known: Bool[Tensor, "frames joints"] | None = None
-) -> list[OutOfRange]:
+def outside(motion: Motion, *, known: Bool[Tensor, "frames joints"] | None = None) -> list[OutOfRange]:
     """List the joints of a canonical motion that turn beyond their ranges by more than TOLERANCE_DEG, the farthest
     first; those that are `known`, if that is given. MapctlError for other skeletons."""
     if motion.skeleton.names != CANONICAL.names:
         raise MapctlError("joint ranges are those of canonical joints; use retarget.to_canonical first")
-    ranges = load() if ranges is None else ranges
+    ranges = load()
     angles = ranges.to_angles(rotations.to_matrix(motion.local_quat_xyzw[:, 1:]))
     excess = torch.rad2deg(ranges.find_excess(angles)).amax(dim=-1)
     if known is not None:
         excess = torch.where(known[:, 1:], excess, 0.0)
-    beyond = excess > TOLERANCE_DEG
-    found = [
-        OutOfRange(name, int(excess[:, joint].argmax()), float(excess[:, joint].max()), int(beyond[:, joint].sum()))
-        for joint, name in enumerate(CANONICAL.names[1:])
-        if bool(beyond[:, joint].any())
-    ]
-    return sorted(found, key=lambda one: -one.degrees)
+    most, frames = excess.max(dim=0)
+    found = map(OutOfRange, CANONICAL.names[1:], frames.tolist(), most.tolist())
+    return sorted((one for one in found if one.degrees > TOLERANCE_DEG), key=lambda one: -one.degrees)
 
 
 @cache

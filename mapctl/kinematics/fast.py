@@ -1,7 +1,7 @@
 """Root integration and forward kinematics of a trial, compiled, with adjoints written by hand, on one core.
 
 `features.integrate_root` and `kinematics.positions_from_matrices` remain the specification, and serve every case but
-float32 on the CPU. Each is one node of torch's graph, differentiable once. Kernels compute in float64 whatever the
+float32 on the CPU. Both are one node of torch's graph, differentiable once. Kernels compute in float64 whatever the
 arrays hold, so that sums over frames stay exact.
 """
 
@@ -18,7 +18,6 @@ from torch.autograd.function import once_differentiable
 
 from mapctl.features import LAYOUT, GroundPose
 from mapctl.numerics.jit import make_jit_decorators
-from mapctl.pose import BodyPose
 from mapctl.skeleton import FEET, Skeleton, find_heels
 
 entry, inner = make_jit_decorators("contract", "nsz")
@@ -246,24 +245,12 @@ def is_supported(features: Tensor, start: GroundPose, skeleton: Skeleton) -> boo
     return plain and constant and fits and skeleton.num_joints == _JOINTS
 
 
-def integrate_root_fast(
-    features: Float[Tensor, "batch frames size"], start: GroundPose
-) -> tuple[Float[Tensor, "batch frames 2"], Float[Tensor, "batch frames"]]:
-    """Integrate root ground positions (metres) and headings (radians, not wrapped): Wang et al. 2019, Eq. 4."""
-    batch = len(features)
-    return _Root.apply(
-        features, start.position_xz.expand(batch, 2).contiguous(), start.heading.expand(batch).contiguous()
-    )
-
-
-def compute_joints_and_heels(
-    features: Float[Tensor, "batch frames size"],
-    root_xz_world: Float[Tensor, "batch frames 2"],
-    heading: Float[Tensor, "batch frames"],
-    skeleton: Skeleton,
-) -> tuple[Float[Tensor, "batch frames joints 3"], Float[Tensor, "batch frames 2 3"]]:
-    """Compute the world positions of joints, and of the left and the right heel (see `skeleton.find_heels`), metres."""
-    return _Body.apply(features, root_xz_world, heading, skeleton)
+def compute_world_poses(
+    features: Float[Tensor, "batch frames size"], start: GroundPose, skeleton: Skeleton
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Compute ground projections of the hips and their headings (Wang et al. 2019, Eq. 4), world positions of joints,
+    and of the left and the right heel (see `skeleton.find_heels`): metres, and radians that are not wrapped."""
+    return _World.apply(features, start, skeleton)
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,7 +277,9 @@ class WorldPoses:
         at, start_heading = start.position_xz.expand(batch, 2).contiguous(), start.heading.expand(batch).contiguous()
         ground, heading = features.new_empty(*known.shape[:2], 2), features.new_empty(known.shape[:2])
         root_forward(known, _COLUMNS, at.numpy(), start_heading.numpy(), ground.numpy(), heading.numpy())
-        positions, heels = _allocate_points(features, bones)
+        positions, heels = (
+            features.new_empty(*known.shape[:2], len(points), 3) for points in (bones.offsets, bones.heels)
+        )
         turns = np.empty((*positions.shape, 3), np.float32)
         body_forward(known, _COLUMNS, ground.numpy(), heading.numpy(), bones, positions.numpy(), heels.numpy(), turns)
         return WorldPoses(ground, heading, positions, heels, known, start_heading.numpy(), bones, turns)
@@ -318,74 +307,18 @@ def _tabulate_bones(skeleton: Skeleton) -> Bones:
     return Bones(np.array(skeleton.parents), offsets, feet, find_heels(skeleton).numpy())
 
 
-def _allocate_points(features: Tensor, bones: Bones) -> tuple[Tensor, Tensor]:
-    joints, heels = (features.new_empty(*features.shape[:2], len(points), 3) for points in (bones.offsets, bones.heels))
-    return joints, heels
-
-
 def _contiguous_array(tensor: Tensor) -> np.ndarray:
     """Return a contiguous array, so that every kernel is compiled once."""
     return tensor.detach().contiguous().numpy()
 
 
-class _Root(torch.autograd.Function):
+class _World(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, features: Tensor, start_xz: Tensor, start_heading: Tensor):
-        ground, heading = features.new_empty(*features.shape[:2], 2), features.new_empty(features.shape[:2])
-        known, at = _contiguous_array(features), start_heading.numpy()
-        root_forward(known, _COLUMNS, start_xz.numpy(), at, ground.numpy(), heading.numpy())
-        ctx.known = known, at
-        return ground, heading
+    def forward(ctx: Any, features: Tensor, start: GroundPose, skeleton: Skeleton):
+        ctx.poses = poses = WorldPoses.compute(features, start, skeleton)
+        return poses.root_xz_world, poses.heading, poses.joints_world, poses.heels_world
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *pulled: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
-        features, start_heading = ctx.known
-        gradient = np.zeros(features.shape, np.float32)
-        root_backward(features, _COLUMNS, start_heading, *map(_contiguous_array, pulled), gradient)
-        return torch.from_numpy(gradient), None, None
-
-
-class _Body(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, features: Tensor, ground: Tensor, heading: Tensor, skeleton: Skeleton):
-        bones = _tabulate_bones(skeleton)
-        positions, heels = _allocate_points(features, bones)
-        world = np.empty((*positions.shape, 3), np.float32)
-        known = _contiguous_array(features)
-        body_forward(
-            known,
-            _COLUMNS,
-            _contiguous_array(ground),
-            _contiguous_array(heading),
-            bones,
-            positions.numpy(),
-            heels.numpy(),
-            world,
-        )
-        ctx.known = known, bones, world
-        return positions, heels
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *pulled: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
-        features, bones, world = ctx.known
-        gradient, shape = np.zeros(features.shape, np.float32), features.shape[:2]
-        ground, heading = np.empty((*shape, 2), np.float32), np.empty(shape, np.float32)
-        body_backward(features, _COLUMNS, bones, world, *map(_contiguous_array, pulled), gradient, ground, heading)
-        return *map(torch.from_numpy, (gradient, ground, heading)), None
-
-
-def place_joints(
-    features: Float[Tensor, "batch frames size"],
-    root_xz_world: Float[Tensor, "batch frames 2"],
-    heading: Float[Tensor, "batch frames"],
-    skeleton: Skeleton,
-) -> Float[Tensor, "batch frames joints 3"]:
-    """Place the joints of features in the world, metres, over these points of the ground, facing these headings.
-
-    Features are of single precision; all tensors lie on one device.
-    """
-    if features.device.type == "cpu":
-        return compute_joints_and_heels(features, root_xz_world, heading, skeleton)[0]
-    return BodyPose.of_features_at(features, root_xz_world, heading).joints_world(skeleton)
+        return torch.from_numpy(ctx.poses.pull_back(*map(_contiguous_array, pulled))), None, None

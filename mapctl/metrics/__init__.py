@@ -20,7 +20,6 @@ from mapctl.joint_roles import find_feet, find_hips, find_upper_legs
 from mapctl.metrics import body, feet
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
-from mapctl.numerics.gaussian import gaussian_kernel, low_pass
 from mapctl.retarget import UNKNOWN_RIG_NOTE
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL
@@ -33,12 +32,11 @@ SWAY_SECONDS = 0.35
 
 def sway(offset: Float[Tensor, "frames"], fps: float) -> float:
     """Return the root mean square of a sideways offset without its slow part; NaN for clips too short (2.2 s)."""
-    kernel = gaussian_kernel(SWAY_SECONDS, fps)
-    reach = len(kernel) // 2
+    reach = int(3 * SWAY_SECONDS * fps)
     if len(offset) <= 2 * reach + 4:
         return math.nan
     # Inside, where the whole kernel lies on the walk.
-    quick = (offset - gaussian.convolve(offset, kernel, "nothing"))[reach:-reach]
+    quick = (offset - gaussian.smooth(offset, SWAY_SECONDS * fps, side=reach))[reach:-reach]
     return float(quick.square().mean().sqrt())
 
 
@@ -115,7 +113,7 @@ def _measure_path(
     on_it = curve.point(arcs if curve.closed else arcs.clamp(0, curve.length))
     apart = on_it - (positions[:, ::2] if positions.shape[1] > curve.dims else positions)
     offset = curve.signed_offset(positions, arcs)
-    slow = low_pass(offset, seconds=LOW_PASS_SECONDS, fps=fps).abs()
+    slow = gaussian.average(offset, seconds=LOW_PASS_SECONDS, fps=fps).abs()
     measures = _summarise_errors("path_error_{}_cm", apart.norm(dim=-1))
     measures |= _summarise_errors("path_error_low_passed_{}_cm", slow)
     measures |= {"sway_cm": sway(offset, fps) * _CM, "travelled_m": travelled}

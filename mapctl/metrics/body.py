@@ -18,7 +18,7 @@ from torch import Tensor
 from mapctl import contacts, rotations
 from mapctl.kinematics import heading_of_matrix
 from mapctl.motion import Motion
-from mapctl.numerics.gaussian import low_pass
+from mapctl.numerics import gaussian
 from mapctl.numerics.intervals import true_intervals
 from mapctl.rotations import unwrap_angle
 
@@ -44,7 +44,7 @@ def facing(left_leg: Float[Tensor, "frames 3"], right_leg: Float[Tensor, "frames
 
 def turn_rate(angle: Float[Tensor, "frames"], fps: float) -> float:
     """Return the mean size of the turn rate after strides are smoothed away, rad/s; NaN for one frame."""
-    return float(low_pass(angle, seconds=TURN_SECONDS, fps=fps).diff().abs().mean() * fps)
+    return float(gaussian.average(angle, seconds=TURN_SECONDS, fps=fps).diff().abs().mean() * fps)
 
 
 def measure_glide(feet: Float[Tensor, "frames 4 3"], fps: float) -> float:

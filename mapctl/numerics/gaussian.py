@@ -4,6 +4,7 @@ from typing import Literal
 
 import torch
 from jaxtyping import Float
+from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 
@@ -29,41 +30,27 @@ def unit_variance_matrix(count: int, sigma: float, dtype: torch.dtype) -> Float[
     return weight / weight.square().sum(dim=-1, keepdim=True).sqrt()
 
 
-def kernel(sigma: float, side: int) -> Float[Tensor, " taps"]:
-    """Return 2 * side + 1 weights that sum to one, the middle one the greatest; `sigma` is in frames."""
-    weight = torch.exp(-0.5 * (torch.arange(-side, side + 1, dtype=torch.float64) / sigma).square())
-    return weight / weight.sum()
-
-
-def convolve(
-    values: Float[Tensor, "frames *width"], taps: Float[Tensor, " taps"], ends: Literal["nothing", "repeated"]
+def smooth(
+    values: Float[Tensor, "frames *width"],
+    sigma: float,
+    *,
+    side: int | None = None,
+    ends: Literal["nearest", "constant"] = "nearest",
 ) -> Float[Tensor, "frames *width"]:
-    """Average the frames around each frame by a kernel's `taps`, odd in number; beyond the ends there is nothing, or
-    the outermost frame repeated."""
-    side = len(taps) // 2
-    channels = values.flatten(1).T[:, None] if values.ndim > 1 else values[None, None]
-    if ends == "repeated":
-        channels, side = torch.nn.functional.pad(channels, (side, side), mode="replicate"), 0
-    out = torch.nn.functional.conv1d(channels, taps.to(values)[None, None], padding=side)[:, 0].T
-    return out.reshape(values.shape)
+    """Average the frames around each frame, `sigma` in frames; so many on either `side` count, or those within three
+    sigmas. Beyond the ends is the frame that is nearest, or nothing (`constant`)."""
+    radius = max(1, round(3 * sigma)) if side is None else side
+    found = gaussian_filter1d(values.cpu().numpy(), max(sigma, 1e-6), axis=0, mode=ends, radius=radius)
+    return torch.from_numpy(found).to(values)
 
 
-def gaussian_kernel(seconds: float, fps: float) -> Float[Tensor, "taps"]:
-    """Return kernel weights that sum to one; `seconds` is the standard deviation."""
-    return kernel(seconds * fps, int(3 * seconds * fps))
-
-
-def low_pass(values: Float[Tensor, "frames"], *, seconds: float, fps: float) -> Float[Tensor, "frames"]:
-    """Smooth a signal, every frame of it: near the ends the weights are those of the frames there are."""
-    kernel = gaussian_kernel(seconds, fps)
-    both = torch.stack([values, torch.ones_like(values)], dim=-1)
-    summed, weight = convolve(both, kernel, "nothing").unbind(dim=-1)
+def average(values: Float[Tensor, "frames *width"], *, seconds: float, fps: float) -> Float[Tensor, "frames *width"]:
+    """Average a signal around each frame; near the ends over the frames there are."""
+    summed, weight = (
+        smooth(each, seconds * fps, side=int(3 * seconds * fps), ends="constant")
+        for each in (values, torch.ones_like(values))
+    )
     return summed / weight
-
-
-def smooth(values: Float[Tensor, "frames *width"], sigma: float) -> Float[Tensor, "frames *width"]:
-    """Smooth values by a kernel of `sigma` frames; ends are held."""
-    return convolve(values, kernel(max(sigma, 1e-6), side=max(1, round(3 * sigma))), "repeated")
 
 
 def envelope(values: Float[Tensor, "frames columns"], seconds: float, fps: float) -> Float[Tensor, "frames columns"]:

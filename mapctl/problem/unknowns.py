@@ -141,36 +141,27 @@ class LatentNoise(Parametrisation):
         return self._hold_heels(context.build_trial(features, plan.contacts, noise, log_density))
 
     def build_detached(self, unknowns: Float[Tensor, "batch unknowns"]) -> Trial | None:
-        context, batch = self.context, len(unknowns)
+        context = self.context
         noise = torch.unflatten(unknowns.detach(), -1, (context.frames, LAYOUT.continuous))
         if not fast.is_supported(noise, context.ground_pose, context.skeleton):
             return None
-        rollout, contacts = self._prepare(batch)
-        features, log_density = rollout.roll_out(noise)
+        features, log_density = self._rollout.roll_out(noise)
         poses = fast.WorldPoses.compute(features, context.ground_pose, context.skeleton)
-        trial = context.build_trial(features, contacts, noise, log_density)
+        trial = context.build_trial(features, self.plan.contacts, noise, log_density)
         return self._hold_heels(replace(trial, world_poses=poses))
 
     def pull_back(self, trial: Trial, gradient: TrialGradient) -> Float[Tensor, "batch unknowns"]:
         assert trial.world_poses is not None
         on_world = (gradient.root_xz_world, gradient.heading, gradient.joints_world, gradient.heels_world)
         d_features = gradient.features + trial.world_poses.pull_back(*on_world)
-        rollout, _ = self._prepare(len(d_features))
-        d_noise = rollout.pull_back(torch.as_tensor(d_features), torch.as_tensor(gradient.log_density))
+        d_noise = self._rollout.pull_back(torch.as_tensor(d_features), torch.as_tensor(gradient.log_density))
         return (d_noise + torch.as_tensor(gradient.noise)).flatten(1)
 
-    def _prepare(self, batch: int) -> tuple[PreparedRollout, Bool[Tensor, "batch frames 2"]]:
-        """Prepare the rollouts of so many candidates, once, and their contacts."""
-        if batch not in self._prepared:
-            plan = self._expand_plan(batch)
-            rollout = self.context.prior.prepare_rollout(self.context.prior_state.expand(batch), plan)
-            self._prepared[batch] = rollout, plan.contacts
-        return self._prepared[batch]
-
     @cached_property
-    def _prepared(self) -> dict[int, tuple[PreparedRollout, Bool[Tensor, "batch frames 2"]]]:
-        rollout, contacts = self.prepared, self.plan.contacts
-        return {} if rollout is None else {len(contacts): (rollout, contacts)}
+    def _rollout(self) -> PreparedRollout:
+        """Rollouts of as many candidates as the plan is for."""
+        state = self.context.prior_state.expand(len(self.plan.contacts))
+        return self.prepared or self.context.prior.prepare_rollout(state, self.plan)
 
     def _hold_heels(self, trial: Trial) -> Trial:
         """Let the planned motion determine which heels are planted in a trial."""

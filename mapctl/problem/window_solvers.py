@@ -121,12 +121,12 @@ class LatentNoiseSolver:
         if self.proposal is not None:
             start = self.proposal(request, start, meter)
         unknowns, best = self._run_round(request, start, meter)
-        start_energy = float(best.start_energy[0])
+        start_energy = best.start_energy
         for _ in range(self.rounds - 1):
-            if meter.exhausted or not best.energy[0] > _STUCK_ENERGY * frames:
+            if meter.exhausted or not best.energy > _STUCK_ENERGY * frames:
                 break
             replanned, again = self._run_round(request, best.x, meter)
-            if not again.energy[0] < best.energy[0]:
+            if not again.energy < best.energy:
                 break
             unknowns, best = replanned, again
         solved = _build_solved_window(unknowns, request.terms, best, meter)
@@ -184,8 +184,6 @@ def minimise_window(
 ) -> SolvedWindow:
     """Minimise the terms' energies over a window's unknowns; the start itself is kept where nothing finite is found."""
     result = minimise(Objective.of(unknowns, terms).energy_and_gradient, start, settings=lbfgs, meter=meter)
-    if not bool(torch.isfinite(result.energy).all()):
-        result = replace(result, x=start)
     return _build_solved_window(unknowns, terms, result, meter)
 
 
@@ -194,12 +192,12 @@ def _build_solved_window(
 ) -> SolvedWindow:
     objective = Objective.of(unknowns, terms)
     trial = objective.build_detached(result.x)
-    frames, energies = trial.features.shape[1], (float(result.start_energy[0]), float(result.energy[0]))
+    frames, energies = trial.features.shape[1], (result.start_energy, result.energy)
     return SolvedWindow(
         trial,
         torch.unflatten(result.x[0], -1, (frames, -1)),
         objective.build_ledger(trial),
-        WindowRecord(frames, 0.0, meter.evaluations, *energies, outcome=result.status[0].value),
+        WindowRecord(frames, 0.0, meter.evaluations, *energies, outcome=result.status.value),
     )
 
 

@@ -194,9 +194,7 @@ def _average(
     values: Float[Tensor, "frames columns"], weight: Float[Tensor, "frames columns"], fps: float, seconds: float
 ) -> Float[Tensor, "frames columns"]:
     """Average values over so many seconds (sigma), over an average weight."""
-    taps = gaussian.gaussian_kernel(seconds, fps)
-    ones = gaussian.convolve(torch.ones_like(values), taps, "nothing")
-    return gaussian.convolve(values, taps, "nothing") / ones / weight
+    return gaussian.average(values, seconds=seconds, fps=fps) / weight
 
 
 def _require_seen(leverage: Tensor, seen: Float[Tensor, "frames columns"], holds_proposal: bool) -> Tensor:

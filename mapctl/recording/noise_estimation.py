@@ -43,9 +43,8 @@ def average_over_time(
 ) -> Float[Tensor, "frames joints 4"]:
     """Average the rotations that were observed about each frame, whatever their signs: the first eigenvector of the
     quaternions' second moment (Markley et al. 2007), weighted by a Gaussian. The sign of each mean is any."""
-    kernel = gaussian.kernel(_MEAN_FRAMES, round(3 * _MEAN_FRAMES))
     outer = torch.einsum("fji,fjk->fjik", quats, quats) * seen.to(quats)[..., None, None]
-    power = gaussian.convolve(outer.flatten(2), kernel, "nothing").unflatten(-1, (4, 4))
+    power = gaussian.smooth(outer, _MEAN_FRAMES, ends="constant")
     for _ in range(_SQUARINGS):
         power = power / power.flatten(2).norm(dim=-1).clamp_min(1e-12)[..., None, None]
         power = power @ power

@@ -1,12 +1,11 @@
 """The terms of the MAP problem. A new one is a file here, a name below and an instance in tests/catalogue.py."""
 
 from mapctl.terms.base import Term
-from mapctl.terms.foot_contact import Clearance, FootContact, LandingSigmas, Support
-from mapctl.terms.jerk import Jerk
+from mapctl.terms.foot_contact import Clearance, FootContact, LandingSigmas
 from mapctl.terms.likelihood import LatentPrior, Likelihood
 from mapctl.terms.motion_tracking import MotionTracking
 from mapctl.terms.path import Path
-from mapctl.terms.positions import KeepApart, KeepClear, Keyframe, WithinReach
+from mapctl.terms.positions import Jerk, KeepApart, KeepClear, Keyframe, WithinReach
 from mapctl.terms.steering import RootVelocity, StepLength
 from mapctl.terms.trial import Trial
 
@@ -24,7 +23,6 @@ __all__ = [
     "Path",
     "RootVelocity",
     "StepLength",
-    "Support",
     "Term",
     "Trial",
     "WithinReach",

@@ -1,7 +1,8 @@
 """Feet: planted toes and heels do not move and are on the ground (Wang et al. 2019, Eq. 18), and land without a snap;
-toes that travel clear the ground; the toe that supports the body does not move, whatever the contact bits.
+toes that travel clear the ground.
 """
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -9,9 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mapctl.contacts import support_speed
 from mapctl.skeleton import TOE_REST_HEIGHT, find_heel_drops
-from mapctl.terms import kernels
 from mapctl.terms.base import TrialGradient
 from mapctl.terms.trial import Trial
 
@@ -31,6 +30,11 @@ class HeelSigmas:
     """Energy of a planted heel, nats, from which on it counts less and less: a foot may roll off earlier than the plan
     from which its contacts come, as where a command changes."""
 
+    @property
+    def sigmas(self) -> tuple[float, float, float]:
+        """Standard deviations of speed, height and depth."""
+        return self.speed, self.height, self.below
+
 
 @dataclass(frozen=True)
 class LandingSigmas:
@@ -45,6 +49,20 @@ class LandingSigmas:
     def scale(self, factor: float) -> "LandingSigmas":
         """Return both times `factor`, a ratio of sizes, for a body of another size."""
         return LandingSigmas(factor * self.free, factor * self.sigma)
+
+    def differentiate(
+        self, before: Float[np.ndarray, "known 2 3"], toes: Float[np.ndarray, "batch frames 2 3"], fps: float
+    ) -> tuple[Float[np.ndarray, "batch frames"], Float[np.ndarray, "batch frames 2 3"]]:
+        """Return the energies of toes, nats, and their gradient; `before` are up to two frames before the window."""
+        past = np.broadcast_to(before, (len(toes), *before.shape))
+        second = fps**2 * np.diff(np.concatenate([past, toes], axis=1), n=2, axis=1)
+        sizes = np.sqrt(np.square(second).sum(-1) + 1e-9 * fps**4)
+        beyond = np.maximum(sizes - self.free, 0) / self.sigma
+        pull = (fps**2 / self.sigma * beyond / sizes)[..., None] * second
+        around = np.diff(np.pad(pull, ((0, 0), (2, 2), (0, 0), (0, 0))), n=2, axis=1)
+        energy = np.zeros(toes.shape[:2])
+        energy[:, 2 - len(before) :] = 0.5 * np.square(beyond).sum(-1)
+        return energy, around[:, len(before) :]
 
 
 @dataclass(frozen=True)
@@ -98,22 +116,21 @@ class FootContact:
 
     def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
         """Add the gradient of the summed energies of a float32 trial, and return the energies, nats."""
-        energy, resting = np.zeros(gradient.log_density.shape), np.empty((trial.features.shape[1], 2))
-        resting[:] = self._rest_heights
-        toes, fps, dtype = trial.joints_world.numpy(), float(trial.fps), trial.features.dtype
-        before, planted = trial.before[-2:].to(dtype).numpy(), trial.planted.numpy()
-        sigmas, d_toes = (self.sigma_speed, self.sigma_height, self.sigma_below), gradient.joints_world
-        kernels.add_contact(toes, before[-1:], planted, trial.toes, fps, sigmas, resting, 0.0, energy, d_toes)
+        toes, resting = list(trial.toes), np.asarray(self._rest_heights)
+        before, after = (each[..., toes, :].double().numpy() for each in (trial.before[-2:], trial.joints_world))
+        fps, planted = float(trial.fps), trial.planted.numpy()
+        sigmas = (self.sigma_speed, self.sigma_height, self.sigma_below)
+        energy, slope = _differentiate_contact(before[-1:], after, planted, resting, sigmas, fps)
         if self.landing is not None:
-            sigmas = (self.landing.free, self.landing.sigma)
-            kernels.add_landing(toes, before, trial.toes, fps, sigmas, energy, d_toes)
+            landing, landing_slope = self.landing.differentiate(before, after, fps)
+            energy, slope = energy + landing, slope + landing_slope
+        gradient.joints_world[:, :, toes] += slope
         if self.heels is not None:
-            heels, before = trial.heels_world.numpy(), trial.heels_before[-1:].to(dtype).numpy()
-            planted, sigmas = trial.heels_planted.numpy(), (self.heels.speed, self.heels.height, self.heels.below)
-            resting, doubt = resting - find_heel_drops(trial.skeleton), float(self.heels.doubt)
-            kernels.add_contact(
-                heels, before, planted, (0, 1), fps, sigmas, resting, doubt, energy, gradient.heels_world
-            )
+            before, after = (each.double().numpy() for each in (trial.heels_before[-1:], trial.heels_world))
+            sigmas, resting = self.heels.sigmas, resting - find_heel_drops(trial.skeleton)
+            planted = trial.heels_planted.numpy()
+            heels, slope = _differentiate_contact(before, after, planted, resting, sigmas, fps, self.heels.doubt)
+            energy, gradient.heels_world[...] = energy + heels, gradient.heels_world + slope
         return energy
 
     @property
@@ -140,6 +157,31 @@ def _hold(
 def _stays(planted: Bool[Tensor, "batch steps 2"]) -> Bool[Tensor, "batch frames 2"]:
     """True where a point is planted in a frame and in the one before it, be that before the window."""
     return planted[:, 1:] & planted[:, :-1]
+
+
+def _differentiate_contact(
+    before: Float[np.ndarray, "known 2 3"],
+    points: Float[np.ndarray, "batch frames 2 3"],
+    planted: Bool[np.ndarray, "batch steps 2"],
+    resting: Float[np.ndarray, "*#frames"],
+    sigmas: tuple[float, float, float],
+    fps: float,
+    doubt: float = math.inf,
+) -> tuple[Float[np.ndarray, "batch frames"], Float[np.ndarray, "batch frames 2 3"]]:
+    """Return the energies of two points, and their gradient; `before` is the frame before the window, if it is known,
+    `sigmas` are of speed, height and depth. From `doubt` nats on a contact counts less and less."""
+    travel, height, below = (fps / sigmas[0]) ** 2, sigmas[1] ** -2, sigmas[2] ** -2
+    above, stands = points[..., 1] - resting, planted[:, 1:]
+    sunk, stays = np.minimum(above, 0), stands & planted[:, :-1]
+    first = np.broadcast_to(before if len(before) else points[:, :1], (len(points), 1, 2, 3))
+    steps = stays[..., None] * np.diff(np.concatenate([first, points], axis=1), axis=1)[..., ::2]
+    held = 0.5 * (height * stands * above**2 + travel * (np.square(steps).sum(-1) + 1e-12 * stays))
+    share = 1 / (1 + held / doubt)
+    energy = 0.5 * below * sunk**2 + (held if math.isinf(doubt) else doubt * np.log1p(held / doubt))
+    slope, pull = np.empty_like(points), travel * share[..., None] * steps
+    slope[..., 1] = below * sunk + height * share * stands * above
+    slope[..., ::2] = -np.diff(pull, axis=1, append=0)
+    return energy.sum(-1), slope
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,23 +216,3 @@ class Clearance:
             wanted = wanted * self.share.to(wanted)
         lacking = wanted - (trial.toe_heights - self.rest_height)
         return torch.where(trial.contacts, 0.0, lacking.clamp_min(0))
-
-
-@dataclass(frozen=True, eq=False)
-class Support:
-    """The slowest of the toes near the ground, which supports the body, does not travel; flight costs nothing."""
-
-    sigma: float = 0.1
-    """Standard deviation of that toe's speed over the ground, m/s; mocap's planted toes move at 0.05."""
-    rest_height: float | Float[Tensor, "frames 2"] = TOE_REST_HEIGHT
-    """Height of the toe joint while the foot is flat on the ground, metres; of each toe's in each frame, if not one."""
-    name: str = "support"
-    unit: str = "m/s"
-
-    def __call__(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Return the energies, nats."""
-        return 0.5 * (self.residual(trial) / self.sigma).square()
-
-    def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
-        """Return the speed of the supporting toe over the ground, m/s; 0 in flight."""
-        return support_speed(trial.toe_heights - self.rest_height, trial.toe_speeds)

@@ -15,9 +15,8 @@ from torch import Tensor
 
 from mapctl.curves import Curve
 from mapctl.numerics import gaussian
-from mapctl.terms import kernels
 from mapctl.terms.base import TrialGradient, length
-from mapctl.terms.kernels import LocalFrame, find_local_frames
+from mapctl.terms.local_frames import LocalFrame, find_local_frames
 from mapctl.terms.trial import Trial
 
 _SLOW_SECONDS = 0.35  # standard deviation of the Gaussian that separates the slow offset from the sway
@@ -54,22 +53,26 @@ class Path:
         offsets = ((positions - near.tangent_extension).unsqueeze(-2) * near.axes).sum(-1)
         beyond = torch.nn.functional.softshrink(offsets[..., :1], self.free_sway)
         errors = torch.cat([beyond, offsets[..., 1:]], dim=-1)
-        sigmas = (self.sigma_raw, self.sigma_progress, self.sigma_height)[: self.curve.dims]
         known, weights = self._build_smoother(trial, offsets.dtype)
         slow = torch.addmm(known, offsets[..., 0], weights)
-        return 0.5 * ((errors / errors.new_tensor(sigmas)).square().sum(-1) + (slow / self.sigma_slow).square())
+        return 0.5 * ((errors / errors.new_tensor(self._sigmas)).square().sum(-1) + (slow / self.sigma_slow).square())
 
     def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
         """Add the gradient of the summed energies of a float32 trial, and return the energies, nats."""
-        positions, energy = self._positions(trial).contiguous(), np.empty(gradient.log_density.shape)
-        near, (known, weights) = self._nearest_frame(positions), self._build_smoother(trial, positions.dtype)
-        pulled = np.zeros(tuple(positions.shape), np.float32)
-        points = (each.numpy() for each in (positions, near.tangent_extension, near.axes, known, weights))
-        sigmas = (self.sigma_raw, self.sigma_progress, self.sigma_height)
-        kernels.add_path(*points, sigmas, self.sigma_slow, self.free_sway, energy, pulled)
+        positions = self._positions(trial)
+        near, smoother = self._nearest_frame(positions), self._build_smoother(trial, positions.dtype)
+        away, axes, known, weights = (
+            each.double().numpy() for each in (positions - near.tangent_extension, near.axes, *smoother)
+        )
+        offsets, sigmas = np.einsum("bfk,bfak->bfa", away, axes), self._sigmas
+        beyond = offsets.copy()
+        beyond[..., 0] -= np.clip(offsets[..., 0], -self.free_sway, self.free_sway)
+        slow = known + offsets[..., 0] @ weights
+        pull = beyond / sigmas**2
+        pull[..., 0] += slow @ weights.T / self.sigma_slow**2
         target = gradient.root_xz_world if self.curve.dims == 2 else gradient.joints_world[:, :, 0]
-        target[...] += pulled
-        return energy
+        target[...] += np.einsum("bfa,bfak->bfk", pull, axes)
+        return 0.5 * (np.square(beyond / sigmas).sum(-1) + np.square(slow / self.sigma_slow))
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the distance to the curve, metres."""
@@ -79,6 +82,11 @@ class Path:
     def _positions(self, trial: Trial) -> Float[Tensor, "batch frames dims"]:
         # On the ground there is no need of the whole body's kinematics.
         return trial.root_xz_world if self.curve.dims == 2 else trial.joints_world[..., 0, :]
+
+    @property
+    def _sigmas(self) -> Float[np.ndarray, " dims"]:
+        """Standard deviations of the sideways offset, the arc and, in space, the height, metres."""
+        return np.array([self.sigma_raw, self.sigma_progress, self.sigma_height][: self.curve.dims])
 
     def _nearest_frame(self, positions: Float[Tensor, "batch frames dims"]) -> LocalFrame:
         return find_local_frames(self.curve, positions, self.arcs, reach=_REACH)

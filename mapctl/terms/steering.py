@@ -14,8 +14,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mapctl.numerics import gaussian
-from mapctl.skeleton import TOES
-from mapctl.terms import kernels
 from mapctl.terms.base import TrialGradient, length
 from mapctl.terms.trial import Trial
 
@@ -53,13 +51,20 @@ class RootVelocity:
 
     def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
         """Add the gradient of the summed energies of a float32 trial, and return the energies, nats."""
+        velocities, units, facing = self._tables
         known, weights = _build_velocity_smoother(self, trial.before, trial.fps, trial.features.dtype)
-        energy, (velocities, units, facing) = np.empty(gradient.log_density.shape), self._tables
-        start = trial.start.position_xz.expand(len(energy), 2)
-        ground = (each.numpy() for each in (trial.root_xz_world, start, known, weights))
-        kernels.add_root_velocity(*ground, velocities, units, float(trial.fps), energy, gradient.root_xz_world)
+        known, weights, ground = known.double().numpy(), weights.double().numpy(), trial.root_xz_world.double().numpy()
+        start = trial.start.position_xz.double().expand(len(ground), 1, 2).numpy()
+        raw = float(trial.fps) * np.diff(ground, axis=1, prepend=start) - velocities
+        error = np.einsum("fak,bfk->bfa", units, known + weights @ raw)
+        pull = weights.T @ np.einsum("fak,bfa->bfk", units, error)
+        gradient.root_xz_world[...] -= float(trial.fps) * np.diff(pull, axis=1, append=0)
+        energy = 0.5 * np.square(error).sum(-1)
         if facing is not None:
-            kernels.add_facing(trial.heading.numpy(), facing, self.sigma_facing, energy, gradient.heading)
+            apart = trial.heading.double().numpy() - facing
+            apart = (apart - 2 * math.pi * np.rint(apart / (2 * math.pi))) / self.sigma_facing
+            gradient.heading[...] += apart / self.sigma_facing
+            energy += 0.5 * np.square(apart)
         return energy
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
@@ -78,7 +83,7 @@ class RootVelocity:
 
     @cached_property
     def _tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-        """Target velocities, axes and headings as kernels read them."""
+        """Target velocities, axes and headings in double precision."""
         facing = None if self.facing is None else self.facing.double().numpy()
         return self.velocities.double().numpy(), self._units.double().numpy(), facing
 
@@ -128,26 +133,36 @@ class StepLength:
 
     def add_gradient(self, trial: Trial, gradient: TrialGradient) -> Float[np.ndarray, "batch frames"]:
         """Add the gradient of the summed energies of a float32 trial, and return the energies, nats."""
-        energy = np.empty(gradient.log_density.shape)
-        feet = (each.numpy() for each in (trial.joints_world, trial.last_before, trial.planted))
-        kernels.add_step_length(*feet, trial.toes, self.length, self.sigma, energy, gradient.joints_world)
-        return energy
+        (row, frame, foot, last), apart = self._measure_steps(trial)
+        lengths, toes = torch.sqrt(apart.square().sum(-1) + 1e-12), torch.tensor(trial.toes)
+        error = self._sum_errors(trial, row, frame, lengths)
+        pull = (error[row, frame] / lengths / self.sigma**2)[:, None] * apart
+        slope, inside = torch.as_tensor(gradient.joints_world)[..., ::2], last >= 0
+        slope.index_put_((row, frame, toes[foot]), pull, accumulate=True)
+        slope.index_put_((row[inside], last[inside], toes[1 - foot[inside]]), -pull[inside], accumulate=True)
+        return 0.5 * np.square(error.double().numpy() / self.sigma)
 
     def residual(self, trial: Trial) -> Float[Tensor, "batch frames"]:
         """Return the error of the step length, metres; 0 between touch-downs."""
         return self._length_error(trial).abs()
 
     def _length_error(self, trial: Trial) -> Float[Tensor, "batch frames"]:
+        (row, frame, *_), apart = self._measure_steps(trial)
+        return self._sum_errors(trial, row, frame, torch.sqrt(apart.square().sum(-1) + 1e-12))
+
+    def _sum_errors(self, trial: Trial, row: Tensor, frame: Tensor, lengths: Tensor) -> Float[Tensor, "batch frames"]:
         errors = torch.zeros_like(trial.features[..., 0])
-        toes = trial.joints_world[..., trial.skeleton.indices(TOES), ::2]
+        return errors.index_put((row, frame), lengths - self.length, accumulate=True)
+
+    def _measure_steps(self, trial: Trial) -> tuple[tuple[Tensor, ...], Float[Tensor, "steps 2"]]:
+        """Find the touch-downs, and the vectors over the ground to each from where the other toe was last planted."""
+        toes = trial.joints_world[..., trial.toes, ::2]
         if len(trial.before):
-            feet = trial.before[-1, trial.skeleton.indices(TOES), ::2].to(toes.dtype)
+            feet = trial.before[-1, trial.toes, ::2].to(toes.dtype)
             toes = torch.cat([feet.expand(len(toes), 1, 2, 2), toes], dim=1)
         shift = int(len(trial.before) > 0)
-        row, frame, foot, last = _find_touch_downs(trial)
-        apart = toes[row, frame + shift, foot] - toes[row, last + shift, 1 - foot]
-        lengths = torch.sqrt(apart.square().sum(-1) + 1e-12)
-        return errors.index_put((row, frame), lengths - self.length, accumulate=True)
+        row, frame, foot, last = found = _find_touch_downs(trial)
+        return found, toes[row, frame + shift, foot] - toes[row, last + shift, 1 - foot]
 
 
 def _find_touch_downs(trial: Trial) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -85,8 +85,12 @@ class Trial:
     def _root(self) -> tuple[Tensor, Tensor]:
         if self.world_poses is not None:
             return self.world_poses.root_xz_world, self.world_poses.heading
-        integrate = fast.integrate_root_fast if self._use_kernels else integrate_root
-        return integrate(self.features, self.start)
+        return self._compiled[:2] if self._use_kernels else integrate_root(self.features, self.start)
+
+    @cached_property
+    def _compiled(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Roots, headings, joints and heels by the compiled kinematics."""
+        return fast.compute_world_poses(self.features, self.start, self.skeleton)
 
     @property
     def root_xz_world(self) -> Float[Tensor, "batch frames 2"]:
@@ -118,7 +122,7 @@ class Trial:
         if self.world_poses is not None:
             return self.world_poses.joints_world, self.world_poses.heels_world
         if self._use_kernels:
-            return fast.compute_joints_and_heels(self.features, self.root_xz_world, self.heading, self.skeleton)
+            return self._compiled[2:]
         return self.pose.joints_and_heels(self.skeleton)
 
     def joint_world(self, name: str) -> Float[Tensor, "batch frames 3"]:

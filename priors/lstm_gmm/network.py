@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS
-from mapctl.kinematics.fast import place_joints
+from mapctl.pose import BodyPose
 from mapctl.protocols import DensityState, DiscreteChoices
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.checkpoints import NetworkConfig, require_at_least
@@ -62,7 +62,7 @@ def condition_on_standing(
     still = torch.cat([torch.zeros_like(before[:, :3]), before[:, 3:]], dim=-1)  # where the frame comes from
     variants = torch.cat([base[:, None] + _CHANGES.to(base), still[:, None]], dim=1)
     ground, heading = LAYOUT.pick(variants, "root_displacement_heading"), LAYOUT.pick(variants, "heading_change")
-    positions = place_joints(variants, ground.contiguous(), heading[..., 0].contiguous(), CANONICAL)
+    positions = BodyPose.of_features_at(variants, ground, heading[..., 0]).joints_world()
     positions = positions[:, :, list(TOE_JOINTS)].flatten(2)
     positions, stood = positions[:, :-1], positions[:, -1]
     given = planted[..., None].expand(-1, -1, 3).flatten(1)

@@ -82,10 +82,12 @@ def test_joints_turn_until_they_are_as_wanted_and_no_further():
 LINE = torch.linspace(0, 3, 40, dtype=torch.float64)
 
 
-def test_a_kernel_adds_up_to_one_and_keeps_lines_inside():
-    kernel = gaussian.kernel(2.0, 6)
-    assert (len(kernel), float(kernel.sum()), int(kernel.argmax())) == (13, pytest.approx(1), 6)
-    torch.testing.assert_close(gaussian.convolve(LINE, kernel, "nothing")[6:-6], LINE[6:-6])
+def test_smoothing_keeps_lines_inside_and_counts_what_there_is_at_the_ends():
+    torch.testing.assert_close(gaussian.smooth(LINE, 2.0, ends="constant")[6:-6], LINE[6:-6])
+    ones = torch.ones(40, 2, 3, dtype=torch.float32)
+    torch.testing.assert_close(gaussian.smooth(ones, 2.0), ones)
+    torch.testing.assert_close(gaussian.average(ones, seconds=0.2, fps=30.0), ones)
+    assert float(gaussian.smooth(ones, 2.0, ends="constant")[0].max()) < 0.7
 
 
 def rest(*values: float) -> MinimumJerkTrack:

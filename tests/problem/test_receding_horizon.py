@@ -73,10 +73,7 @@ def test_every_window_keeps_its_budget_and_progress_is_reported():
 
 def test_a_deadline_reaches_into_a_window():
     endless = LatentNoiseSolver(
-        lbfgs=LbfgsSettings(
-            max_iterations=10**6, gradient_tolerance=0.0, relative_energy_tolerance=-1.0, max_trials=10**6
-        ),
-        budget=Budget(),
+        lbfgs=LbfgsSettings(max_iterations=10**6, relative_energy_tolerance=-1.0), budget=Budget()
     )
     began = time.monotonic()
     done, outcome = solve(80, method=endless, deadline=began + 0.5)

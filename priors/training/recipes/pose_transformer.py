@@ -386,7 +386,7 @@ def _roughen(draw: Draws, root: Float[Tensor, "batch frames 3"], path: Bool[Tens
         return root
     rows = path.any(dim=1)
     ground = root[rows][..., ::2]
-    smooth = gaussian.convolve(ground.transpose(0, 1), gaussian.kernel(8.0, 24), "repeated").transpose(0, 1)
+    smooth = gaussian.smooth(ground.transpose(0, 1), 8.0).transpose(0, 1)
     knots = 0.06 * draw.normal(2, 6)[rows] * (draw.uniform(1, 1)[rows] < 0.5)
     astray = torch.nn.functional.interpolate(knots, size=root.shape[1], mode="linear", align_corners=True)
     smooth = smooth + astray.transpose(1, 2)

@@ -17,7 +17,6 @@ from mapctl.contacts import compute_phases, mirror_phases, reversed_phases
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, GroundPose, integrate_root, mirror_features, reversed_features
 from mapctl.kinematics import forward_kinematics
-from mapctl.kinematics.fast import place_joints
 from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.stitcher import (
@@ -217,7 +216,7 @@ class Transition:
     def place_joints(self, generated: int) -> Float[Tensor, "2 batch generated joints 3"]:
         """Place the joints of the frames that each side is to make first, metres, seen from the first pose."""
         ground, heading = self.integrate()
-        positions = place_joints(self.features[:, self.between], ground, heading, CANONICAL)
+        positions = BodyPose.of_features_at(self.features[:, self.between], ground, heading).joints_world()
         return torch.stack([positions[:, :generated], positions[:, :-1].flip(1)[:, :generated]])
 
     def true_phases(self) -> Float[Tensor, "2 batch frames 4"]:
