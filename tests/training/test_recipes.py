@@ -16,13 +16,16 @@ from trainable_models import small_settings
 
 from mapctl import kinematics, rotations
 from mapctl.features import LAYOUT, GroundPose, mirror_features
+from mapctl.inbetweening import Proposal
 from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts
 from mapctl.inbetweening.pose_pairs import PosePairs
 from mapctl.inbetweening.root_trajectory import LocalMotion, RootTrajectory
 from mapctl.pose import decode
+from mapctl.protocols import Inbetweener
 from mapctl.skeleton import CANONICAL
 from mapctl.terms.trial import Trial
 from priors.path import PathNetwork
+from priors.training import gaps
 from priors.training.critics import FREE_RUN_MOMENTS, HistoryBuffer, MomentWeights, moment_loss, show
 from priors.training.data import Corpus, find_window_starts
 from priors.training.recipes import tweener
@@ -39,7 +42,6 @@ from priors.training.recipes.tweener import (
     draw_style_poses,
     draw_windows,
     group_clips,
-    measure_gap,
 )
 from priors.training.windows import FeatureWindows, PaddedWindows, PoseWindows, add_targets
 from priors.tweener import LABELS, ConstrainedPose, GeneratedPoses, GeneratorNetwork
@@ -317,12 +319,34 @@ def test_gaps_between_keys_grow_and_splices_lie_in_long_ones(windows, whole_keys
     assert found > 3
 
 
-def test_slerp_between_two_poses_is_measured_beside_what_is_generated(windows):
-    motion = windows.at(torch.tensor([0]), torch.zeros(1, dtype=torch.long), 100, torch.ones(1))
-    found = measure_gap(TrueMotion(motion), motion)
-    assert found["generated"].error < 1e-3 * found["generated"].count
-    assert found["slerp"].error > 0.5 * found["slerp"].count
-    assert found["slerp"].jerk < 0.2 * found["true"].jerk
+class Answers(Inbetweener):
+    """The truth, the interpolation, or that far off."""
+
+    def __init__(self, truth=None, metres=0.0):
+        self.truth, self.metres = truth, metres
+
+    def propose(self, query, *, generator=None):
+        motion = query.motion if self.truth is None else self.truth.pop(0)
+        away = torch.tensor([0.0, self.metres, 0.0]) * query.nothing_known[:, None]
+        return Proposal(
+            replace(motion, root_position=motion.root_position + away), torch.zeros(motion.num_frames, 2), ""
+        )
+
+
+def test_gaps_in_unseen_clips_are_measured_beside_the_interpolation(monkeypatch):
+    monkeypatch.setattr(gaps, "_WINDOWS", 3)
+    clips = corpus(2, 60)
+    found = gaps.measure_gaps(Answers(), clips, (5, 30, 50))
+    assert [name for name in found if name.startswith("error")] == ["error_5_cm", "error_30_cm"]  # no clip has 70
+    assert found["share_5"] == found["share_30"] == 1
+    assert 0.1 < found["error_5_cm"] < found["error_30_cm"]
+    starts = torch.linspace(0, 2 * (60 - 50 + 1) - 1, 3).long().tolist()
+    first = [start if start < 11 else start + 49 for start in starts]
+    windows = [clips.features[start : start + 50] for start in first]
+    origin = GroundPose.origin(torch.float64)
+    truth = [decode(window.double(), origin) for window in windows]
+    found = gaps.measure_gaps(Answers(truth, metres=0.03), clips, (30,))
+    assert found["error_30_cm"] == pytest.approx(3.0, abs=1e-4)
 
 
 def test_clips_are_grouped_by_the_class_in_their_names():

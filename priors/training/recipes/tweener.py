@@ -10,7 +10,7 @@ positions on the ground, and drawings seen from one side.
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -21,10 +21,10 @@ from tyro.conf import arg
 
 from mapctl import kinematics, motion_dna, rotations
 from mapctl.errors import RequestError
-from mapctl.inbetweening.partial_motion import KnownParts, PartialMotion, interpolate_partial_motion
+from mapctl.inbetweening.partial_motion import PartialMotion
 from mapctl.inbetweening.position_image import mirror_positions
 from mapctl.inbetweening.root_trajectory import LocalMotion, RootTrajectory, compute_displacement_errors
-from mapctl.metrics.body import NOTHING, Liveliness, measure_liveliness, see_from_hips
+from mapctl.metrics.body import see_from_hips
 from mapctl.motion_dna import MotionDna
 from mapctl.numerics.intervals import last_observed, next_observed, true_intervals
 from mapctl.pose import BodyPose
@@ -32,23 +32,16 @@ from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors import checkpoints
 from priors.path import ConvPathPredictor, PathNetwork
 from priors.training.data import Corpus, Split
-from priors.training.loop import (
-    Count,
-    Export,
-    GradientTrainer,
-    Name,
-    NetworkSettings,
-    Row,
-    geometric_mean,
-    make_generator,
-)
-from priors.training.windows import KINDS, PoseWindows, choose_rows, find_kind, measure_lengths
+from priors.training.gaps import InbetweenerTrainer
+from priors.training.loop import Count, Export, Name, NetworkSettings, Row, make_generator
+from priors.training.windows import PoseWindows, choose_rows, measure_lengths
 from priors.tweener import (
     LABELS,
     PAPER,
     GeneratorConfig,
     GeneratorNetwork,
     GivenParts,
+    Tweener,
     encode_classes,
     find_class,
     make_key_image,
@@ -103,11 +96,6 @@ _OPEN_ENDS = 0.1  # share of sequences that begin, and as many that end, without
 _SPEED = 1.5  # m/s, below which the hips travel where clips are spliced
 _HALVES, _POSITION_KEYS, _DRAWINGS = 0.1, 0.1, 0.1  # shares with keys of parts, of ground positions, and drawings
 
-# Validation.
-_VALIDATED_FRAMES = 192  # of the gap that is validated, 6.4 s; of shorter clips all but the ends
-_SHORTEST_VALIDATED = 90
-_VALIDATED_OF_KIND = 24
-
 
 @dataclass(frozen=True, eq=False)
 class KeySequences:
@@ -159,8 +147,10 @@ class TweenerSettings(NetworkSettings):
         return TweenerTrainer(self, parts.train)
 
 
-class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
+class TweenerTrainer(InbetweenerTrainer[GeneratorNetwork]):
     """Draws sequences, hides all but their keys, and brings the generator nearer to what was between."""
+
+    gaps = (45, 90, 180)
 
     def __init__(self, settings: TweenerSettings, corpus: Corpus):
         self.path = ConvPathPredictor.load(settings.path).network.to(torch.get_default_device())
@@ -199,15 +189,9 @@ class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
         styled = torch.rand(len(poses), generator=self.generator) < _STYLED
         return compute_tweener_losses(self.network, self.path, sequences, poses, styled)
 
-    def validate(self, corpus: Corpus) -> dict[str, Any]:
-        """Measure gaps of unseen clips (see `measure_kinds`)."""
-        return measure_kinds(self.network, corpus)
-
-    def score(self, row: Row) -> float:
-        """Return the error of unseen gaps over slerp's, geometric mean over kinds of clips."""
-        kinds = [name.removesuffix("_slerp_cm") for name, value in row.items() if name.endswith("_slerp_cm") and value]
-        pairs = [(row.get(f"{kind}_error_cm"), row[f"{kind}_slerp_cm"]) for kind in kinds]
-        return geometric_mean(error / slerp for error, slerp in pairs if error is not None)
+    def make_inbetweener(self, network: GeneratorNetwork) -> Tweener:
+        card = checkpoints.Card(self.settings.kind, {}, licence="")
+        return Tweener("in training", network, card, ConvPathPredictor.load(self.settings.path))
 
     def identify(self) -> Row:
         """Return the path predictor, which must not change between a run's parts."""
@@ -591,57 +575,6 @@ def draw_style_poses(
     local = rotations.to_matrix(torch.where(other[:, None, None, None], windows.gather(clip, time).quats, own))
     local[..., 0, :, :] = torch.eye(3)
     return kinematics.positions_from_matrices(CANONICAL, local)
-
-
-@torch.no_grad()
-def measure_kinds(network: GeneratorNetwork, corpus: Corpus) -> dict[str, Any]:
-    """Measure gaps by kind of clips: error beside slerp's, cm, and speed, spread and jerk over mocap's, of sums."""
-    windows = PoseWindows(corpus, evenness=1.0)
-    kind_of = [find_kind(name) for name in corpus.names]
-    row: dict[str, Any] = {}
-    for kind, name in enumerate([*KINDS, "other"]):
-        found = [number for number, each in enumerate(kind_of) if each == kind]
-        found = [one for one in found if int(windows.lengths[one]) >= _SHORTEST_VALIDATED + 2]
-        if found:
-            row |= {f"{name}_{what}": value for what, value in _measure_clips(network, windows, found).items()}
-    return row
-
-
-def _measure_clips(network: GeneratorNetwork, windows: PoseWindows, clips: Sequence[int]) -> dict[str, float]:
-    sums = {"generated": NOTHING, "slerp": NOTHING, "true": NOTHING}
-    for number in clips[:_VALIDATED_OF_KIND]:
-        frames = min(_VALIDATED_FRAMES + 2, int(windows.lengths[number]))
-        motion = windows.at(torch.tensor([number]), torch.zeros(1, dtype=torch.long), frames, torch.ones(1))
-        for name, found in measure_gap(network, motion).items():
-            sums[name] += found
-    generated, slerp, true = (sums[name] for name in ("generated", "slerp", "true"))
-    return {
-        "error_cm": generated.error / generated.count,
-        "slerp_cm": slerp.error / slerp.count,
-        "speed": generated.speed / true.speed,
-        "spread": generated.spread / true.spread,
-        "jerk": generated.jerk / true.jerk,
-    }
-
-
-@torch.no_grad()
-def measure_gap(network: GeneratorNetwork, motion: PartialMotion) -> dict[str, Liveliness]:
-    """Measure the motion generated between the first and the last pose of one motion, beside slerp and the truth."""
-    known = torch.zeros(motion.heading.shape, dtype=torch.bool)
-    known[:, [0, -1]] = True
-    image = make_key_image(motion, GivenParts.whole(known))
-    generated = network(image, torch.zeros(1, network.config.style)).turn_to_world(image)
-    local = motion.local_matrices()
-    true = see_from_hips(kinematics.positions_from_matrices(CANONICAL, local), local[..., 0, :, :])[0]
-    shown = replace(motion, known=KnownParts.whole(known))
-    guess = interpolate_partial_motion(shown, motion.quats[0, 0], 0.0).local_matrices()
-    slerp = see_from_hips(kinematics.positions_from_matrices(CANONICAL, guess), guess[..., 0, :, :])[0]
-    mine = see_from_hips(generated.positions, generated.local_matrix[..., 0, :, :])[0]
-    inside = ~known[0]
-    return {
-        name: measure_liveliness(seen, true, inside)
-        for name, seen in (("generated", mine), ("slerp", slerp), ("true", true))
-    }
 
 
 CLIPS_OF_CLASS = 24
