@@ -160,7 +160,6 @@ def make_key_image(motion: PartialMotion, given: GivenParts) -> PositionImage:
         heading,
         see_contacts(motion.contacts, given.known),
         known=given.axes.all(dim=-1),
-        present=torch.ones_like(given.heading),
         known_axes=given.axes,
     )
 
@@ -361,8 +360,7 @@ class GeneratorNetwork(nn.Module):
         step = rotations.rotate_ground(step, -image.heading) / _VELOCITY_UNIT
         turn = torch.diff(image.heading, dim=1, prepend=image.heading[:, :1])[..., None] / _HEADING_UNIT
         parts = [positions.flatten(-2), distances.flatten(-2), step, turn, times]
-        rows = torch.cat([*parts, 2 * image.contacts - 1], dim=-1)
-        return rows * image.present[..., None].to(rows)
+        return torch.cat([*parts, 2 * image.contacts - 1], dim=-1)
 
 
 class _Affine(nn.Module):
@@ -738,7 +736,6 @@ def _show(query: GapQuery, given: Mapping[int, Float[Tensor, "joints 3"]]) -> tu
         heading(body.local_quat_xyzw[:, 0]).float()[None],
         see_contacts(planted[None], known.any(dim=1)[None]),
         known=known[None],
-        present=torch.ones(1, len(positions), dtype=torch.bool),
     )
     return (image if query.loose is None else show_loose_keys(image, query.loose)), origin
 

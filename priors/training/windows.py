@@ -264,27 +264,10 @@ class PoseWindows:
         return rotations.average(torch.cat([sample, mirror_quats(sample)]).double()).float()
 
 
-class PaddedWindows:
-    """Draws windows from a corpus, half of them mirrored, in which shorter clips lie whole."""
-
-    def __init__(self, corpus: Corpus, *, frames: int, evenness: float):
-        """`evenness` among the corpus' top folders: 0 draws by their frames, 1 the same number from each."""
-        self.frames, self.poses = frames, PoseWindows(corpus, evenness=0.0)
-        folder, lengths = number_clip_folders(corpus), self.poses.lengths
-        share = torch.zeros(int(folder.max()) + 1).index_add(0, folder, lengths.float())
-        self.probabilities = lengths / share[folder] ** evenness
-
-    def draw(self, batch: int, generator: torch.Generator) -> tuple[PartialMotion, Bool[Tensor, "batch frames"]]:
-        """So many windows, clips by chance and moments evenly, and whether a clip has each of their frames."""
-        clip = torch.multinomial(self.probabilities, batch, replacement=True, generator=generator)
-        length = self.poses.lengths[clip]
-        spare = length - self.frames  # a shorter clip begins anywhere in the window
-        lead = (torch.rand(batch, generator=generator) * (spare.abs() + 1)).long() * torch.sign(spare)
-        mirrored = torch.rand(batch, generator=generator) < 0.5
-        frame = lead[:, None] + torch.arange(self.frames)
-        present = (frame >= 0) & (frame < length[:, None])
-        motion = self.poses.gather(clip[:, None].expand_as(frame), frame.clamp_min(0).double())
-        return choose_rows(mirrored, motion.mirrored(), motion), present
+def draw_length(shortest: int, longest: int, generator: torch.Generator) -> int:
+    """Draw the frames of windows, as often of each octave; the shortest where the longest is shorter."""
+    share = float(torch.rand((), generator=generator))
+    return round(shortest * (max(shortest, longest) / shortest) ** share)
 
 
 def find_kind(name: str) -> int:

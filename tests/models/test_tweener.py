@@ -22,7 +22,6 @@ from mapctl.numerics.intervals import fill_missing_angle
 from mapctl.recording.masks import ALL, Mask, MissingMask
 from mapctl.retarget import to_canonical
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOE_REST_HEIGHT
-from priors.training.recipes.infiller import interpolate_positions
 from priors.training.recipes.tweener import collect_dna
 from priors.tweener import (
     INPUT_ROWS,
@@ -251,18 +250,16 @@ def count(module):
     return sum(each.numel() for each in module.parameters())
 
 
-def image_of(motion, keys, *, present=None, known_axes=None):
+def image_of(motion, keys, *, known_axes=None):
     """Whole poses are known at the keys."""
     known = torch.zeros(1, motion.num_frames, 21, dtype=torch.bool)
     known[:, list(keys)] = True
     positions, facing = motion.joint_positions().float()[None], heading(motion.local_quat_xyzw[:, 0]).float()[None]
-    between = interpolate_positions(positions, motion.local_quat_xyzw.float()[None], known)
     return PositionImage.of_world(
-        between,
+        positions,
         fill_missing_angle(facing, known[..., 0]),
         torch.zeros(1, motion.num_frames, 2),
         known=known,
-        present=torch.ones(1, motion.num_frames, dtype=torch.bool) if present is None else present,
         known_axes=known_axes,
     )
 

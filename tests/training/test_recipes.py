@@ -30,7 +30,7 @@ from priors.training.critics import FREE_RUN_MOMENTS, HistoryBuffer, MomentWeigh
 from priors.training.data import Corpus, find_window_starts
 from priors.training.recipes import tweener
 from priors.training.recipes.denoiser import compute_denoiser_losses, draw_performers
-from priors.training.recipes.infiller import compute_infiller_losses, sample_observation_mask
+from priors.training.recipes.infiller import compute_infiller_losses
 from priors.training.recipes.keyframe_timing import solve_weights
 from priors.training.recipes.lstm_gmm import compute_feature_statistics
 from priors.training.recipes.path import compute_path_losses
@@ -43,7 +43,7 @@ from priors.training.recipes.tweener import (
     draw_windows,
     group_clips,
 )
-from priors.training.windows import FeatureWindows, PaddedWindows, PoseWindows, add_targets
+from priors.training.windows import FeatureWindows, PoseWindows, add_targets
 from priors.tweener import LABELS, ConstrainedPose, GeneratedPoses, GeneratorNetwork
 
 pytestmark = pytest.mark.usefixtures("small_judgements")
@@ -163,34 +163,15 @@ def test_an_untrained_denoiser_errs_by_as_much_as_the_corruption():
     assert parts["contacts_nats"] == pytest.approx(math.log(2), rel=1e-3)
 
 
-@pytest.mark.parametrize("frames", [32, 120])
-@pytest.mark.parametrize("progress", [0.0, 1.0])
-def test_gaps_leave_something_known_and_nothing_that_is_absent(frames, progress):
-    first = torch.randint(0, frames // 2, (200, 1), generator=generator())
-    present = torch.arange(frames) >= first
-    known = sample_observation_mask(present, progress=progress, generator=generator(1))
-    assert known.shape == (200, frames, CANONICAL.num_joints)
-    assert known.any(dim=(1, 2)).all()
-    assert not known[~present].any()
-
-
-def test_gaps_grow_until_half_of_training():
-    present = torch.ones(400, 120, dtype=torch.bool)
-    lost = [
-        float((~sample_observation_mask(present, progress=share, generator=generator()).any(dim=2)).float().mean())
-        for share in (0.0, 0.25, 0.5, 1.0)
-    ]
-    assert lost[0] < lost[1] < lost[2] == lost[3]
-
-
 @pytest.mark.parametrize("architecture", ["skips", "image"])
 def test_an_infiller_answers_for_what_it_changes(architecture):
-    motion, present = PaddedWindows(corpus(2, 60), frames=60, evenness=0.0).draw(4, generator())
-    everything = present[..., None].expand(-1, -1, CANONICAL.num_joints)
+    motion = PoseWindows(corpus(2, 60), evenness=0.0).draw(4, 50, generator())
     network = tiny_infiller.network(config=replace(tiny_infiller.CONFIG, architecture=architecture))
-    parts = compute_infiller_losses(network, motion, present, everything)
+    parts = compute_infiller_losses(network, motion, motion)
     assert parts["error_cm"] == 0
-    assert (parts["position"] == 0) == (architecture == "skips")
+    assert (parts["position"] < 1e-4) == (architecture == "skips")
+    parts = compute_infiller_losses(tiny_infiller.network(), motion, with_gap(motion, 20, 30))
+    assert parts["position"] > 0.1
 
 
 class TrueTrajectory(PathNetwork):

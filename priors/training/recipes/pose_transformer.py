@@ -23,7 +23,7 @@ from priors.training.augment import Draws
 from priors.training.data import Corpus, Split
 from priors.training.gaps import InbetweenerTrainer
 from priors.training.loop import Count, Export, NetworkSettings, Number, make_adam, make_generator
-from priors.training.windows import PoseVariation, PoseWindows, add_targets, measure_lengths
+from priors.training.windows import PoseVariation, PoseWindows, add_targets, draw_length, measure_lengths
 
 _SHORTEST_WINDOW = 8  # frames
 _CALIBRATED_WINDOWS, _CALIBRATED_FRAMES = 128, (10, 20, 40, 60, 90)
@@ -103,8 +103,7 @@ class PoseTransformerTrainer(InbetweenerTrainer[PoseTransformerNetwork]):
         return {"optimiser": make_adam(others, self.settings.learning_rate), "muon": muon}
 
     def losses(self) -> dict[str, Tensor]:
-        share = float(torch.rand((), generator=self.generator))
-        frames = round(_SHORTEST_WINDOW * (self.longest / _SHORTEST_WINDOW) ** share)
+        frames = draw_length(_SHORTEST_WINDOW, self.longest, self.generator)
         batch = max(1, self.settings.batch // frames)
         truth = add_targets(self.windows.draw(batch, frames, self.generator, variation=PoseVariation()))
         return compute_losses(self.network, truth, sample_known_parts(truth, self.generator))

@@ -34,7 +34,7 @@ from priors.path import ConvPathPredictor, PathNetwork
 from priors.training.data import Corpus, Split
 from priors.training.gaps import InbetweenerTrainer
 from priors.training.loop import Count, Export, Name, NetworkSettings, Row, make_generator
-from priors.training.windows import PoseWindows, choose_rows, measure_lengths
+from priors.training.windows import PoseWindows, choose_rows, draw_length, measure_lengths
 from priors.tweener import (
     LABELS,
     PAPER,
@@ -170,19 +170,15 @@ class TweenerTrainer(InbetweenerTrainer[GeneratorNetwork]):
     def losses(self) -> dict[str, Tensor]:
         batch, progress, generator = self.settings.batch, self.progress, self.generator
         shortest, reach = min(_SHORTEST_WINDOW, self.longest), round(1.25 * find_longest_gap(progress))
-        frames = self._draw_frames(shortest, min(self.longest, shortest + reach))
+        frames = draw_length(shortest, min(self.longest, shortest + reach), generator)
         count = max(1, round((1 - _SPLICED) * batch / frames))
         one = draw_windows(self.windows, count, frames, progress=progress, generator=generator)
-        frames = self._draw_frames(*_SPLICE)
+        frames = draw_length(*_SPLICE, generator)
         count = max(1, round(_SPLICED * batch / frames))
         other = draw_splices(self.windows, count, frames, progress=progress, generator=generator)
         parts, spliced = self._compare(one, 0.0), self._compare(other, _FOREIGN_STYLES)
         parts["loss"] = parts["loss"] + spliced["loss"]
         return parts | {f"spliced_{name}": spliced[name] for name in ("keys_cm", "root_cm", "style_cm", "dwell_cm")}
-
-    def _draw_frames(self, shortest: int, longest: int) -> int:
-        share = float(torch.rand((), generator=self.generator))
-        return round(shortest * (max(shortest, longest) / shortest) ** share)
 
     def _compare(self, sequences: KeySequences, foreign: float) -> dict[str, Tensor]:
         poses = draw_style_poses(self.windows, sequences, foreign, self.generator)
