@@ -321,34 +321,23 @@ class LstmGmm(nn.Module):
         """Draw frames one after the other (section 4.1.4); temperature scales the Gaussians' sigmas, with `sigma_speed`
         each frame is drawn given that toes stand where its bits are 1 (see `condition_on_standing`), and `condition` is
         as in `forward`. Without gradient, unless `differentiable` in the weights for the drawn components and bits."""
+        drawn, device, there, size = [], self.mean.device, generator.device, LAYOUT.continuous
         with torch.set_grad_enabled(differentiable and torch.is_grad_enabled()):
-            return self._draw(state, frames, generator, temperature, sigma_speed, condition)
-
-    def _draw(
-        self,
-        state: LstmState,
-        frames: int,
-        generator: torch.Generator,
-        temperature: float,
-        sigma_speed: float | None,
-        condition: Tensor | None,
-    ) -> tuple[Tensor, LstmState]:
-        drawn, device, cholesky = [], self.mean.device, self.cholesky
-        there, size = generator.device, LAYOUT.continuous
-        for _ in range(frames):
-            mixture, state = self._step(state, condition)
-            weights = mixture.log_weight.detach().exp().to(there)
-            component = torch.multinomial(weights, 1, generator=generator)[:, 0].to(device)
-            noise = temperature * torch.randn(len(weights), size, generator=generator, device=there).to(device)
-            planted = torch.sigmoid(mixture.contact_logit.detach())  # probability
-            bits = torch.rand(planted.shape, generator=generator, device=there).to(device) < planted
-            frame, _ = self._compose(mixture, component, noise, bits, cholesky)
-            if sigma_speed is not None:
-                gaussian = self._find_gaussian(mixture, component, cholesky, temperature)
-                frame = condition_on_standing(sigma_speed, state.last_frame, frame, *gaussian, generator)
-            state = LstmState(frame, state.hidden, state.cell)
-            drawn.append(frame)
-        return torch.stack(drawn, dim=1), state
+            cholesky = self.cholesky
+            for _ in range(frames):
+                mixture, state = self._step(state, condition)
+                weights = mixture.log_weight.detach().exp().to(there)
+                component = torch.multinomial(weights, 1, generator=generator)[:, 0].to(device)
+                noise = temperature * torch.randn(len(weights), size, generator=generator, device=there).to(device)
+                planted = torch.sigmoid(mixture.contact_logit.detach())  # probability
+                bits = torch.rand(planted.shape, generator=generator, device=there).to(device) < planted
+                frame, _ = self._compose(mixture, component, noise, bits, cholesky)
+                if sigma_speed is not None:
+                    gaussian = self._find_gaussian(mixture, component, cholesky, temperature)
+                    frame = condition_on_standing(sigma_speed, state.last_frame, frame, *gaussian, generator)
+                state = LstmState(frame, state.hidden, state.cell)
+                drawn.append(frame)
+            return torch.stack(drawn, dim=1), state
 
     def plan(self, state: LstmState, noise: Float[Tensor, "batch frames continuous"]) -> DiscreteChoices:
         """The likeliest component and contact bits of each frame along the rollout that the noise gives."""

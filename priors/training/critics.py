@@ -63,14 +63,6 @@ class HistoryBuffer:
     def __init__(self, windows: Float[Tensor, "size frames features"]):
         self.windows = windows.clone()
 
-    def mix(self, fresh: Float[Tensor, "batch frames features"], generator: torch.Generator) -> Tensor:
-        """Return half a batch of the fresh ones and half of kept ones; the fresh half then replaces kept ones."""
-        half = len(fresh) // 2
-        picked = torch.randperm(len(self.windows), generator=generator)
-        mixed = torch.cat([fresh[: len(fresh) - half], self.windows[picked[:half]]])
-        self.windows[picked[half : 2 * half]] = fresh[:half]
-        return mixed
-
     def keep(self, fresh: Float[Tensor, "batch frames features"], generator: torch.Generator) -> None:
         """Put the fresh ones in place of kept ones."""
         picked = torch.randperm(len(self.windows), generator=generator)[: len(fresh)]

@@ -326,7 +326,8 @@ def test_a_density_is_conditioned_on_the_labels_of_a_clips_trajectory():
     state, noise = density.initial_states.state.pick(torch.tensor([0])), torch.zeros(1, 3, 66)
     plan = density.plan(state, noise)
 
-    for name, given in (("set/b_run_old_9.bvh", ["run", "old"]), ("set/b_walk_old_9.bvh", ["old"]), ("other.bvh", [])):
-        like, on = density.conditioned_like_clip(name), density.conditioned_on(given)
+    given = {"a_run_old_1": ["run", "old"], "a_walk_old_2": ["old"], "a_walk_new_3": [], "a_run_new_4": ["run"]}
+    for start, name in enumerate(density.initial_states.names):
+        like, on = density.conditioned_like_start(start), density.conditioned_on(given[name])
         assert torch.allclose(like.rollout(state, noise, plan)[0], on.rollout(state, noise, plan)[0])
         assert like.initial_states.names == density.initial_states.names

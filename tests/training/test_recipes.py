@@ -127,11 +127,11 @@ def test_a_critic_of_free_runs_joins_the_last_steps_and_a_run_goes_on_from_among
     assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
 
 
-def test_a_history_keeps_half_of_what_a_critic_is_shown():
+def test_a_history_puts_fresh_windows_in_place_of_kept_ones():
     history = HistoryBuffer(torch.zeros(10, 2, 3))
-    mixed = history.mix(torch.ones(4, 2, 3), generator())
-    assert mixed[:, 0, 0].tolist() == [1, 1, 0, 0]
-    assert float(history.windows[:, 0, 0].sum()) == 2
+    history.keep(torch.ones(4, 2, 3), generator())
+    assert float(history.windows[:, 0, 0].sum()) == 4
+    assert float(history.draw(400, generator())[:, 0, 0].mean()) == pytest.approx(0.4, abs=0.08)
 
 
 def test_the_distance_of_roots_is_that_of_the_decoded_motions():
@@ -354,7 +354,15 @@ def test_the_share_of_standing_windows_is_drawn_and_all_that_go(share):
     standing = corpus(1, 300).features.clone()
     standing[:, LAYOUT.slices["root_displacement_heading"]] = 0.0
     clips = Corpus(("a", "b"), (300, 120), torch.cat([standing, corpus(1, 120).features]))
-    everything = find_window_starts(clips.lengths, 20)
-    left = FeatureWindows(clips, 20, standing_share=share).starts
-    assert int((left < 280).sum()) / int((everything < 280).sum()) == pytest.approx(share, abs=0.05)
-    assert int((left >= 300).sum()) == int((everything >= 300).sum())
+    starts = find_window_starts(clips.lengths, 20)
+    drawn = FeatureWindows(clips, 20, standing_share=share).draw(20_000, generator()).first
+    stood, went = torch.bincount(torch.searchsorted(starts, drawn)).split([281, 101])
+    assert float(stood.double().mean() / went.double().mean()) == pytest.approx(share, abs=0.05)
+    assert int(went.min()) > 0
+
+
+@pytest.mark.parametrize(("evenness", "share"), [(0.0, 0.9), (0.5, 0.75), (1.0, 0.5)])
+def test_windows_are_evened_among_top_folders(evenness, share):
+    clips = Corpus(("one/a", "two/b"), (919, 119), corpus(1, 1038).features)
+    drawn = FeatureWindows(clips, 20, evenness=evenness).draw(4000, generator()).first
+    assert float((drawn < 919).double().mean()) == pytest.approx(share, abs=0.03)

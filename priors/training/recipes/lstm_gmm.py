@@ -106,8 +106,8 @@ class DensitySettings(NetworkSettings):
     """Last steps in which a critic joins that separates a second of a free run from captured motion, and the density is
     trained to pass as well; what is kept is then the running mean of the weights."""
     standing_share: Number = 1.0
-    """Share of the windows of standing characters that training sees, 1 by default: below it for motion that mostly
-    stands, whose density is hard to steer into a walk otherwise."""
+    """How often windows of standing characters are drawn, as a share of others: below 1 for motion that mostly stands,
+    whose density is hard to steer into a walk otherwise."""
 
     def __post_init__(self):
         super().__post_init__()

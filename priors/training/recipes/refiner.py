@@ -219,7 +219,9 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
         """One update of the critic (Eq. 10) on captured windows, fresh refined ones and kept ones."""
         with torch.no_grad():
             fresh, _ = self.refiner(self._draw(self.raw))
-        generated = self.history.mix(fresh, self.generator)
+        half = len(fresh) // 2
+        generated = torch.cat([fresh[half:], self.history.draw(half, self.generator)])
+        self.history.keep(fresh[:half], self.generator)
         odds = self.critic(torch.cat([self._draw(self.captured), generated]))
         truth = torch.cat([torch.ones(len(odds) - len(generated)), torch.zeros(len(generated))])
         loss = cross_entropy(odds, truth[:, None].expand_as(odds))
