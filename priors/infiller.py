@@ -16,7 +16,7 @@ from mapctl.numerics.intervals import count_frames_to_observed
 from mapctl.protocols import Inbetweener
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
-from priors.checkpoints import NetworkConfig
+from priors.checkpoints import NetworkConfig, Size, Sizes
 
 Architecture = Literal["skips", "image"]
 _LEAK = 0.2
@@ -123,14 +123,14 @@ class InfillerConfig(NetworkConfig):
 
     architecture: Architecture = "skips"
     """Architecture: `skips` is ours, which keeps what is known, `image` that of Kaufmann et al. 2020."""
-    widths: tuple[int, ...] = (128, 160, 192, 256, 256)
+    widths: Sizes = (128, 160, 192, 256, 256)
     """Channels of the units of `skips`; those of `image` are fixed."""
-    kernel: int = 3
+    kernel: Size = 3
     """Width of a convolution of `skips`, frames."""
 
     def __post_init__(self):
-        if min(self.widths, default=0) < 1 or self.kernel < 1 or self.kernel % 2 == 0:
-            raise RequestError(f"an infiller needs positive widths and an odd kernel, got {self}")
+        if self.kernel % 2 == 0:
+            raise RequestError(f"an infiller's kernel must be odd, got {self.kernel}")
 
 
 class InfillerNetwork(nn.Module):

@@ -37,7 +37,7 @@ from mapctl.numerics.smooth_offsets import interpolate_turns, smooth_between
 from mapctl.protocols import Inbetweener, PathPredictor
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOE_REST_HEIGHT
 from priors import checkpoints
-from priors.checkpoints import Card, NetworkConfig
+from priors.checkpoints import Card, NetworkConfig, Size, Sizes
 from priors.path import ConvPathPredictor, ResidualConv
 
 _SAMPLES = 129  # of a curve, to tell how long it is
@@ -233,21 +233,19 @@ class GeneratorConfig(NetworkConfig):
 
     FIXED: ClassVar = {"keys": "dense", "architecture": "two-stage"}
 
-    widths: tuple[int, ...] = (96, 128, 192, 256, 288, 288)
+    widths: Sizes = (96, 128, 192, 256, 288, 288)
     """Channels of the encoder's layers, each of which halves the frames."""
-    up_widths: tuple[int, ...] = (288, 288, 256, 192, 128, 96)
+    up_widths: Sizes = (288, 288, 256, 192, 128, 96)
     """Channels of the decoder's stages, each of which doubles them."""
-    style: int = 128
+    style: Size = 128
     """Numbers of the vector that a motion's style becomes."""
     skips: bool = True
     """Whether the decoder's stages also see the style, and what the encoder was given at their rate, which the paper's
     do not."""
 
     def __post_init__(self):
-        if len(self.widths) != _STAGES or len(self.up_widths) != _STAGES or min(*self.widths, *self.up_widths) < 1:
-            raise RequestError(f"a generator needs {_STAGES} positive widths down and as many up, got {self}")
-        if self.style < 1:
-            raise RequestError(f"a generator needs a style of at least one number, got {self.style}")
+        if len(self.widths) != _STAGES or len(self.up_widths) != _STAGES:
+            raise RequestError(f"a generator needs {_STAGES} widths down and as many up, got {self}")
 
 
 PAPER = GeneratorConfig((384, 384, 512, 512, 768, 1024), (1024, 768, 768, 512, 512, 512), style=1024, skips=False)

@@ -30,7 +30,7 @@ from mapctl.features import LAYOUT, PRIOR_FPS
 from mapctl.kinematics.fast import place_joints
 from mapctl.protocols import DensityState, DiscreteChoices
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
-from priors.checkpoints import NetworkConfig, require_at_least
+from priors.checkpoints import NetworkConfig, Size
 
 _CHANGE = 2e-3  # of a feature, by which steps are differentiated
 _JOINTS = LAYOUT.slices["joint_rotations"].start
@@ -85,9 +85,9 @@ NOISE_UNIT = 0.1
 class LstmGmmConfig(NetworkConfig):
     """Shape of the network."""
 
-    width: int = 500
+    width: Size = 500
     """Units of every hidden layer."""
-    components: int = 5
+    components: Size = 5
     """Gaussians in the mixture."""
     retain: float = 0.9
     """Share of the current (normalised) frame carried into the means; 0 is the paper's absolute prediction."""
@@ -103,9 +103,6 @@ class LstmGmmConfig(NetworkConfig):
     """Whether the level of the noise on the input is an input of the network."""
     labels: tuple[str, ...] = ()
     """Labels on which it can be conditioned, each yes or no: `gait=run`, `style=active`."""
-
-    def __post_init__(self):
-        require_at_least(self, 1, "width", "components")
 
 
 PAPER = LstmGmmConfig(width=500, components=5, retain=0.0, correlated=False, knows_noise=False)

@@ -15,7 +15,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from datetime import timedelta
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
@@ -230,7 +230,8 @@ class NetworkSettings(Settings):
         """Return the shape of the network that these settings ask for."""
         config: Any = self.papers if getattr(self, "paper", False) else self.ours
         given = {name: getattr(self, name) for name in self.shape_options if name != "paper"}
-        return replace(config, **{name: value for name, value in given.items() if value is not None})
+        changes = {name: value for name, value in given.items() if value is not None}
+        return type(config).of_card(config.as_card() | changes)
 
     def find_config(self) -> Any:
         """Return the shape of the network: that of the initial model, where there is one."""
