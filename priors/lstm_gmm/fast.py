@@ -648,8 +648,7 @@ class FastRollout:
 
     def plan(self, state: LstmState, noise: Float[Tensor, "batch frames continuous"]) -> DiscreteChoices:
         """The likeliest component and contact bits of each frame along the rollout that the noise gives."""
-        batch, frames, _ = noise.shape
-        return FastWindow(self, state, _allocate_choices(batch, frames), batch, keeps=False).plan(noise)
+        return self.plan_window(state, noise, keeps=False)[0]
 
     def rollout(
         self, state: LstmState, noise: Float[Tensor, "batch frames continuous"], plan: DiscreteChoices
@@ -659,8 +658,7 @@ class FastRollout:
         Differentiable, once, with respect to the noise. ValueError if the plan does not fit noise and network
         (compiled code would read past its arrays).
         """
-        window = self.prepare(state, plan, keeps=noise.requires_grad)
-        return _Rollout.apply(noise, window)
+        return _Rollout.apply(noise, self.prepare(state, plan, keeps=noise.requires_grad))
 
     def sample(
         self, state: LstmState, frames: int, generator: torch.Generator, *, temperature: float = 1.0
@@ -686,11 +684,11 @@ class FastRollout:
         return FastWindow(self, state, choices, batch, keeps=keeps)
 
     def plan_window(
-        self, state: LstmState, noise: Float[Tensor, "batch frames continuous"]
+        self, state: LstmState, noise: Float[Tensor, "batch frames continuous"], *, keeps: bool = True
     ) -> tuple[DiscreteChoices, "FastWindow"]:
-        """`plan`, and rollouts prepared under it, of which that of this noise is done already."""
+        """`plan`, and rollouts prepared under it, of which that of this noise is done already; `keeps` as `prepare`."""
         batch, frames, _ = noise.shape
-        window = FastWindow(self, state, _allocate_choices(batch, frames), batch)
+        window = FastWindow(self, state, _allocate_choices(batch, frames), batch, keeps=keeps)
         return window.plan(noise), window
 
 

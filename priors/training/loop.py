@@ -42,6 +42,8 @@ _FIRST_LINE_SECONDS, _LINE_SECONDS = 5.0, 30.0  # to the first line on the losse
 _WARM_UP_SHARE = 0.05  # share of the steps in which the learning rate rises
 _MAX_GRADIENT_NORM = 1.0
 _MOST_NAMED = 5  # files that a warning names
+VALIDATED_BATCHES = 6
+"""Batches whose mean losses are those of unseen clips."""
 _MAY_CHANGE = (
     *("data", "out", "cuts", "level", "licence", "resume", "quiet", "patience", "steps", "device", "bfloat16", "shape"),
     *("checkpoint_minutes", "report_steps", "validate_steps"),
@@ -364,6 +366,10 @@ class GradientTrainer(Trainer[Network]):
         """Compute that of the current step."""
         return self.settings.learning_rate * warmup_cosine(self.step, self.steps)
 
+    def score(self, row: Row) -> float:
+        """Return the loss of unseen clips."""
+        return row.get("loss") or math.nan
+
     def limit_gradients(self) -> None:
         """Clip the gradients before the optimiser's step."""
         nn.utils.clip_grad_norm_(self.weights(), _MAX_GRADIENT_NORM)
@@ -467,11 +473,11 @@ def train(settings: Settings) -> Path:
             if last or time.monotonic() >= due:
                 rate = (trainer.step - first) / max(1e-9, time.monotonic() - began)
                 left = timedelta(seconds=round((trainer.steps - trainer.step) / rate))
-                means = ", ".join(f"{name} {value:.3f}" for name, value in _average(losses).items())
+                means = ", ".join(f"{name} {value:.3f}" for name, value in average_rows(losses).items())
                 settings.report(f"step {trainer.step}/{trainer.steps}: {means}, {rate:.3g} steps/s, {left} left")
                 due = time.monotonic() + _LINE_SECONDS
             if last or trainer.step % settings.report_steps == 0:
-                log.write(trainer.step, TRAINING, _average(losses))
+                log.write(trainer.step, TRAINING, average_rows(losses))
                 losses = []
         if stopped is not None:
             settings.report(f"{stopped}: training ends with the best weights so far")
@@ -652,10 +658,10 @@ def _finite(values: Mapping[str, Any]) -> Row:
     return {name: v if isinstance(v, int | float) and math.isfinite(v) else None for name, v in values.items()}
 
 
-def _average(rows: Sequence[Row]) -> Row:
+def average_rows(rows: Sequence[Row]) -> Row:
     """Mean of each loss over the rows that have it."""
     names = dict.fromkeys(name for row in rows for name in row)
-    found = {name: [row[name] for row in rows if name in row] for name in names}
+    found = {name: [float(row[name]) for row in rows if name in row] for name in names}
     return {name: sum(values) / len(values) for name, values in found.items()}
 
 
