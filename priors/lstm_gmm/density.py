@@ -257,14 +257,8 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
         found = minimise(differentiate(energy), start, settings=_SEARCH, meter=Meter(_BUDGET))
         return state_of(found.x)
 
-    def log_prob(
-        self,
-        features: Float[Tensor, "batch frames size"],
-        state: LstmState,
-        *,
-        inputs: Float[Tensor, "batch frames size"] | None = None,
-    ) -> Float[Tensor, "batch frames"]:
-        return self.reference.log_prob(features, state, inputs=inputs)
+    def log_prob(self, features: Float[Tensor, "batch frames size"], state: LstmState) -> Float[Tensor, "batch frames"]:
+        return self.reference.log_prob(features, state)
 
     def advance(self, state: LstmState, committed: Float[Tensor, "batch frames size"]) -> LstmState:
         return self.reference.advance(state, committed)

@@ -19,7 +19,14 @@ from mapctl.skeleton import TOE_JOINTS
 from priors.checkpoints import Card
 from priors.lstm_gmm import density
 from priors.lstm_gmm.density import LstmGmmDensity
-from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig, LstmState, condition_on_standing
+from priors.lstm_gmm.network import (
+    MAX_LOG_SIGMA,
+    MIN_LOG_SIGMA,
+    LstmGmm,
+    LstmGmmConfig,
+    LstmState,
+    condition_on_standing,
+)
 from priors.training.recipes.lstm_gmm import DensityTrainer, compute_feature_statistics, select_initial_states
 
 SIZE = LAYOUT.continuous
@@ -57,18 +64,16 @@ def test_the_density_is_a_mixture_of_normals_times_two_bernoullis(kind):
     network, frames = NETWORKS[kind], clip()
     state = warm(network)
     mixture = mixture_of(network, state, frames)
-    cholesky = torch.eye(SIZE).double().expand(network.config.components, -1, -1)
-    if network.inverse_cholesky is not None:
-        cholesky = torch.linalg.inv(network.inverse_cholesky)
-        torch.testing.assert_close(network.cholesky, cholesky)
+    cholesky = torch.linalg.inv(network.inverse_cholesky)
+    torch.testing.assert_close(network.cholesky, cholesky)
     normals = MultivariateNormal(mixture.mean, scale_tril=cholesky * mixture.log_sigma.exp().unsqueeze(-2))
     poses = MixtureSameFamily(Categorical(logits=mixture.log_weight), normals)
     bits = Independent(Bernoulli(logits=mixture.contact_logit), 1)
     expected = poses.log_prob(network.normalise(frames)[..., :SIZE]) + bits.log_prob(frames[..., SIZE:])
     torch.testing.assert_close(network.log_prob(frames, state), expected)
     torch.testing.assert_close(mixture.log_weight.exp().sum(-1), torch.ones(2, 9).double())
-    assert float(mixture.log_sigma.min()) > network.config.min_log_sigma
-    assert float(mixture.log_sigma.max()) < network.config.max_log_sigma
+    assert float(mixture.log_sigma.min()) > MIN_LOG_SIGMA
+    assert float(mixture.log_sigma.max()) < MAX_LOG_SIGMA
 
 
 @each_network
@@ -113,8 +118,7 @@ def test_draws_follow_the_mixture(kind):
     weight = mixture.log_weight[0, 0].exp()[:, None]
     mean = (weight * mixture.mean[0, 0]).sum(0)
     variance = (2 * mixture.log_sigma[0, 0]).exp()
-    if network.cholesky is not None:
-        variance = (network.cholesky**2 @ variance.unsqueeze(-1))[..., 0]
+    variance = (network.cholesky**2 @ variance.unsqueeze(-1))[..., 0]
     second = (weight * (mixture.mean[0, 0] ** 2 + variance)).sum(0)
     error = (second - mean**2).sqrt() / count**0.5
     values = network.normalise(drawn)[:, 0]
