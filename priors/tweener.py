@@ -486,7 +486,7 @@ def read_classes(card: Card, size: int) -> dict[str, Style]:
     for name, given in card.data.get(_FIELD, {}).items():
         try:
             vector = np.frombuffer(base64.b64decode(given["vector"], validate=True), "<f2").astype(np.float32)
-        except (KeyError, TypeError, ValueError) as error:
+        except ValueError as error:
             raise CheckpointError(f"the class {name} in the card holds no vector ({error})") from error
         if len(vector) != size or not np.isfinite(vector).all():
             raise CheckpointError(f"the class {name} in the card must hold {size} finite numbers, got {len(vector)}")

@@ -25,6 +25,7 @@ from priors.training.data import Corpus, find_window_starts, number_clip_folders
 
 KINDS = ("walk-turn", "walk", "run|dash", "^cmu")
 """Kinds of clips, as patterns of their names, among which windows are evened; clips of none are another kind."""
+_EVENNESS = 0.85  # among these kinds: 0 draws by their frames, 1 the same number of each
 _CHUNK_FRAMES = 50_000  # frames
 _GOING = 0.25  # m/s that the hips of a walking character reach, on average over the frames around one
 _AROUND = 9  # frames, so that a shift of weight is no walk
@@ -161,14 +162,13 @@ and hands: legs keep their length, the unit of all others. Half of the windows v
 
 
 class WindowPicker:
-    """Picks where windows begin in a corpus, clips of every kind alike."""
+    """Picks where windows begin in a corpus, clips of all KINDS about alike."""
 
-    def __init__(self, corpus: Corpus, *, evenness: float):
-        """`evenness` among KINDS of clips: 0 draws by their frames, 1 the same number of each kind."""
+    def __init__(self, corpus: Corpus):
         self.lengths = corpus.locate_clips()[0]
         kind = torch.tensor([find_kind(name) for name in corpus.names])
         share = torch.zeros(len(KINDS) + 1).index_add(0, kind, self.lengths.float())
-        self.weights = share[kind] ** -evenness
+        self.weights = share[kind] ** -_EVENNESS
 
     def pick(
         self, span: Int[Tensor, " batch"], generator: torch.Generator
@@ -184,9 +184,8 @@ class WindowPicker:
 class PoseWindows:
     """Draws windows from a corpus."""
 
-    def __init__(self, corpus: Corpus, *, evenness: float):
-        """`evenness` among KINDS of clips: 0 draws by their frames, 1 the same number of each kind."""
-        self.picker = WindowPicker(corpus, evenness=evenness)
+    def __init__(self, corpus: Corpus):
+        self.picker = WindowPicker(corpus)
         self.lengths, self.starts = corpus.locate_clips()
         self.ground, self.heading = corpus.integrate_roots()
         self.height = LAYOUT.pick(corpus.features, "root_height")

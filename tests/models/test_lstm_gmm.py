@@ -27,7 +27,8 @@ from priors.lstm_gmm.network import (
     LstmState,
     condition_on_standing,
 )
-from priors.training.recipes.lstm_gmm import DensityTrainer, compute_feature_statistics, select_initial_states
+from priors.training.data import compute_feature_statistics
+from priors.training.recipes.lstm_gmm import DensityTrainer, select_initial_states
 
 SIZE = LAYOUT.continuous
 

@@ -50,7 +50,7 @@ def seen_from_the_root(motion):
 
 def test_a_window_is_the_motion_from_that_frame_on():
     data = corpus(3, 60)
-    found = PoseWindows(data, evenness=0.0).at(torch.tensor([1, 2]), torch.tensor([10, 36]), 24, torch.ones(2))
+    found = PoseWindows(data).at(torch.tensor([1, 2]), torch.tensor([10, 36]), 24, torch.ones(2))
     positions = found.world_poses()[0]
     for row, (clip, first) in enumerate(((1, 10), (2, 36))):
         features = data.features[60 * clip : 60 * (clip + 1)]
@@ -63,7 +63,7 @@ def test_a_window_is_the_motion_from_that_frame_on():
 
 
 def test_a_mirrored_window_is_the_window_in_a_mirror():
-    plain = PoseWindows(corpus(3, 60), evenness=0.0).at(torch.tensor([2]), torch.tensor([20]), 30, torch.ones(1))
+    plain = PoseWindows(corpus(3, 60)).at(torch.tensor([2]), torch.tensor([20]), 30, torch.ones(1))
     positions = plain.mirrored().world_poses()[0]
     # The walk itself in a mirror, but for where it starts and faces.
     wanted = seen_from_the_root(walks(3, 60)[2].mirror())[20:50]
@@ -73,7 +73,7 @@ def test_a_mirrored_window_is_the_window_in_a_mirror():
 
 def test_the_guess_in_a_gap_is_the_one_that_filling_starts_from():
     """From the rotations of a batch, and of a motion on its rig, bent by the velocities beside the gap, too."""
-    shown = PoseWindows(corpus(3, 60), evenness=0.0).at(torch.tensor([1]), torch.tensor([3]), 40, torch.ones(1))
+    shown = PoseWindows(corpus(3, 60)).at(torch.tensor([1]), torch.tensor([3]), 40, torch.ones(1))
     known = torch.ones(1, 40, dtype=torch.bool)
     known[:, 10:25] = False
     quats = rotations.from_matrix(shown.local_matrices()[0].double())
@@ -103,7 +103,7 @@ def clips():
 
 @pytest.fixture(scope="module")
 def windows(clips):
-    return PoseWindows(clips, evenness=0.0)
+    return PoseWindows(clips)
 
 
 def decode_feet(features):

@@ -27,12 +27,11 @@ from mapctl.terms.trial import Trial
 from priors.path import PathNetwork
 from priors.training import gaps
 from priors.training.critics import FREE_RUN_MOMENTS, HistoryBuffer, MomentWeights, moment_loss, show
-from priors.training.data import Corpus, find_window_starts
+from priors.training.data import Corpus, compute_feature_statistics, find_window_starts
 from priors.training.recipes import tweener
 from priors.training.recipes.denoiser import compute_denoiser_losses, draw_performers
 from priors.training.recipes.infiller import compute_infiller_losses
 from priors.training.recipes.keyframe_timing import solve_weights
-from priors.training.recipes.lstm_gmm import compute_feature_statistics
 from priors.training.recipes.path import compute_path_losses
 from priors.training.recipes.pose_transformer import compute_losses, hide, sample_known_parts
 from priors.training.recipes.refiner import compute_realism_gap, compute_root_error
@@ -116,8 +115,7 @@ def test_a_critic_of_free_runs_joins_the_last_steps_and_a_run_goes_on_from_among
     parts = settings.gather()
     whole, first, second = (settings.make_trainer(parts) for _ in range(3))
     rows = [whole.train_step() for _ in range(6)]
-    assert [row["critic"] for row in rows[:3]] == pytest.approx([2 * math.log(2)] * 3)
-    assert all(row["critic"] != rows[0]["critic"] for row in rows[3:])
+    assert [("critic" in row) for row in rows] == [False] * 3 + [True] * 3
     for _ in range(4):
         first.train_step()
     second.load_state(first.state(), 4)
@@ -165,7 +163,7 @@ def test_an_untrained_denoiser_errs_by_as_much_as_the_corruption():
 
 @pytest.mark.parametrize("architecture", ["skips", "image"])
 def test_an_infiller_answers_for_what_it_changes(architecture):
-    motion = PoseWindows(corpus(2, 60), evenness=0.0).draw(4, 50, generator())
+    motion = PoseWindows(corpus(2, 60)).draw(4, 50, generator())
     network = tiny_infiller.network(config=replace(tiny_infiller.CONFIG, architecture=architecture))
     parts = compute_infiller_losses(network, motion, motion)
     assert parts["error_cm"] == 0
@@ -188,7 +186,7 @@ class TrueTrajectory(PathNetwork):
 
 
 def test_a_path_costs_what_its_steps_sum_up_to_over_every_span_and_its_height():
-    motion = PoseWindows(corpus(3, 100), evenness=1.0).draw(2, 80, generator())
+    motion = PoseWindows(corpus(3, 100)).draw(2, 80, generator())
     motion = replace(motion, heading=torch.zeros_like(motion.heading))
     assert float(compute_path_losses(TrueTrajectory(motion), motion)["loss"]) < 0.02
     longer = compute_path_losses(TrueTrajectory(motion, stretch=1.1), motion)
@@ -199,7 +197,7 @@ def test_a_path_costs_what_its_steps_sum_up_to_over_every_span_and_its_height():
 
 
 def test_a_transformer_that_is_untrained_errs_as_interpolation_does_and_a_true_answer_costs_nothing():
-    truth = add_targets(PoseWindows(corpus(2, 60), evenness=0.0).draw(4, 40, generator()))
+    truth = add_targets(PoseWindows(corpus(2, 60)).draw(4, 40, generator()))
     parts = compute_losses(tiny_transformer.network(), truth, truth)
     assert all(parts[name] < 1e-2 for name in ("positions_cm", "pace_cm", "turns"))
     hidden = with_gap(truth, 10, 25)
@@ -211,7 +209,7 @@ def test_a_transformer_that_is_untrained_errs_as_interpolation_does_and_a_true_a
 
 @pytest.mark.parametrize("frames", [8, 40])
 def test_parts_that_stay_known_are_the_motions_own(frames):
-    truth = add_targets(PoseWindows(corpus(2, 90), evenness=1.0).draw(400, frames, generator()))
+    truth = add_targets(PoseWindows(corpus(2, 90)).draw(400, frames, generator()))
     shown = sample_known_parts(truth, generator(1))
     known = shown.known
     assert bool((known.rotations | known.root[..., None]).any(dim=2).any(dim=1).all())
@@ -238,7 +236,7 @@ class TrueMotion(GeneratorNetwork):
 
 @pytest.fixture(scope="module")
 def windows():
-    return PoseWindows(corpus(6, 150), evenness=1.0)
+    return PoseWindows(corpus(6, 150))
 
 
 def tweener_losses(sequences, windows, turned=0.0):

@@ -36,7 +36,6 @@ _CHUNK_FRAMES = 50_000
 _PACE = 1.0  # of the joints' velocity error, cm a frame
 _FEET = 0.05  # of the planted toes' error in velocity, cm a frame
 _CONTACTS = 0.1  # of the contacts' cross entropy, nats
-_EVENNESS = 0.85  # of windows among kinds of clips: 0 by their frames, 1 the same number from each
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +67,7 @@ class InfillerTrainer(InbetweenerTrainer[InfillerNetwork]):
     model, gaps = ConvInfiller, (15, 30, 60)
 
     def __init__(self, settings: InfillerSettings, corpus: Corpus):
-        self.windows = PoseWindows(corpus, evenness=_EVENNESS)
+        self.windows = PoseWindows(corpus)
         self.longest = min(settings.window, int(self.windows.lengths.max()))
         self.config = settings.find_config()
         super().__init__(settings, lambda: InfillerNetwork(self.config, bfloat16=settings.bfloat16))

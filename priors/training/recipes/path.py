@@ -58,7 +58,7 @@ class PathTrainer(GradientTrainer[PathNetwork]):
     """Draws windows, and brings the trajectory that the network predicts of them nearer to their own."""
 
     def __init__(self, settings: PathSettings, corpus: Corpus):
-        self.windows = PoseWindows(corpus, evenness=1.0)
+        self.windows = PoseWindows(corpus)
         self.config = settings.find_config()
         super().__init__(settings, lambda: PathNetwork(self.config, bfloat16=settings.bfloat16))
         _set_moments(self.network, self.windows)
@@ -70,7 +70,7 @@ class PathTrainer(GradientTrainer[PathNetwork]):
     @torch.no_grad()
     def validate(self, corpus: Corpus) -> Row:
         """Measure the losses of unseen windows, drawn alike each time."""
-        windows, generator = PoseWindows(corpus, evenness=1.0), make_generator(0)
+        windows, generator = PoseWindows(corpus), make_generator(0)
         return average_rows([self._compare(windows, generator) for _ in range(VALIDATED_BATCHES)])
 
     def _compare(self, windows: PoseWindows, generator: torch.Generator) -> dict[str, Tensor]:

@@ -40,7 +40,6 @@ _HIPS = 5.0  # of the distance of the hips, metres
 _FEET = 5.0  # of the planted toes' steps, metres a frame
 _CONTACTS = 0.05  # of the contacts' cross entropy, nats
 _EASE = 0.4  # how much windows count for more whose interpolation errs little: 0 all alike, 1 by the share of its error
-_EVENNESS = 0.85  # of windows among kinds of clips: 0 by their frames, 1 the same number from each
 
 # What stays known: a window has gaps, lost joints, or keys.
 _LOST = 0.22  # share of windows that lose joints
@@ -81,7 +80,7 @@ class PoseTransformerTrainer(InbetweenerTrainer[PoseTransformerNetwork]):
     model, gaps = PoseTransformer, (5, 15, 30, 45, 60, 120)
 
     def __init__(self, settings: PoseTransformerSettings, corpus: Corpus):
-        self.windows = PoseWindows(corpus, evenness=_EVENNESS)
+        self.windows = PoseWindows(corpus)
         self.longest = min(settings.window, int(self.windows.lengths.max()) * 9 // 10 - 1)
         self.config = settings.find_config()
         super().__init__(settings, lambda: PoseTransformerNetwork(self.config, bfloat16=settings.bfloat16))
@@ -122,7 +121,7 @@ class PoseTransformerTrainer(InbetweenerTrainer[PoseTransformerNetwork]):
 
 def _measure_spread(network: PoseTransformerNetwork, corpus: Corpus, seed: int) -> list[Tensor]:
     """Measure by quantile the logarithm of errors over the spread."""
-    generator, windows = make_generator(seed), PoseWindows(corpus, evenness=1.0)
+    generator, windows = make_generator(seed), PoseWindows(corpus)
     found: list[Tensor] = []
     for frames in _CALIBRATED_FRAMES:
         if frames <= int(windows.lengths.max()):

@@ -21,7 +21,7 @@ from priors.checkpoints import require_at_least
 from priors.lstm_gmm.density import LstmGmmDensity
 from priors.refiner import PAPER, LstmRefiner, RefinerConfig, RefinerNetwork, compute_end_effectors
 from priors.training.critics import WINDOW_MOMENTS, EndEffectorCritic, HistoryBuffer, moment_loss
-from priors.training.data import Corpus, Split, find_window_starts
+from priors.training.data import Corpus, Split, compute_feature_statistics, find_window_starts
 from priors.training.loop import (
     Count,
     Export,
@@ -276,9 +276,7 @@ def compute_root_error(before: Tensor, after: Tensor) -> Tensor:
 def compute_statistics(corpus: Corpus, config: RefinerConfig, window: int) -> dict[str, Tensor]:
     """Mean and spread of features and end effectors over captured clips, with floors that keep held joints in hand."""
     features = corpus.features
-    mean, std = features.mean(0), features.std(0).clamp(min=0.002)
-    bits = LAYOUT.slices["contacts"]
-    mean[bits], std[bits] = 0.5, 0.5
+    mean, std = compute_feature_statistics(features)
     starts = find_window_starts(corpus.lengths, window)[:: max(1, window)]
     reach = torch.cat(
         [

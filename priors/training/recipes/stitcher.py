@@ -47,7 +47,6 @@ _LEAST_WINDOW = 16  # frames of the longest transition
 _CONTEXT = 10  # frames known before or after, at most
 _LENGTH_GROWTH = 0.5  # share of training in which transitions become longer
 _AVERAGE = 0.999
-_EVENNESS = 0.85  # of windows among kinds of clips: 0 by their frames, 1 the same number from each
 _LEAST_SPREAD = 0.05  # of a feature, of the typical one of its block
 _EASE = 0.4  # power of the interpolation's error by which windows count less
 _EASE_METRES = 0.05  # error at which they count 1
@@ -104,7 +103,7 @@ class StitcherTrainer(InbetweenerTrainer[StitcherNetwork]):
 
     def __init__(self, settings: StitcherSettings, corpus: Corpus):
         self.config = config = settings.find_config()
-        self.windows = TransitionWindows(corpus, evenness=_EVENNESS)
+        self.windows = TransitionWindows(corpus)
         self.longest = min(config.longest, settings.window, max(corpus.lengths) - 2 * _CONTEXT - 1)
         if self.longest < _SHORTEST:
             raise RequestError(f"a stitcher needs clips of {_SHORTEST + 2 * _CONTEXT + 1} frames and more")
@@ -152,7 +151,7 @@ class StitcherTrainer(InbetweenerTrainer[StitcherNetwork]):
 
     def export(self, parts: Split) -> Export:
         """Return the average of the weights, with draws as wide as they come near to the truth."""
-        windows = TransitionWindows(parts.validation, evenness=1.0)
+        windows = TransitionWindows(parts.validation)
         self.average.temperature.fill_(calibrate_temperature(self.average, windows))
         return super().export(parts)
 
@@ -217,13 +216,12 @@ class Transition:
 class TransitionWindows:
     """Draws transitions from a corpus, half of them mirrored."""
 
-    def __init__(self, corpus: Corpus, *, evenness: float):
-        """`evenness` among kinds of clips, as `WindowPicker` takes it."""
+    def __init__(self, corpus: Corpus):
         self.features = corpus.features
         self.phases = torch.cat([compute_phases(LAYOUT.pick(clip, "contacts")) for clip in corpus.clips()]).to(
             self.features
         )
-        self.picker = WindowPicker(corpus, evenness=evenness)
+        self.picker = WindowPicker(corpus)
         self.starts = corpus.locate_clips()[1]
 
     def draw(self, batch: int, frames: int, known: Known, generator: torch.Generator) -> Transition:

@@ -155,7 +155,7 @@ class TweenerTrainer(InbetweenerTrainer[GeneratorNetwork]):
     def __init__(self, settings: TweenerSettings, corpus: Corpus):
         self.path = ConvPathPredictor.load(settings.path).network.to(torch.get_default_device())
         self.path.reduced_precision = settings.bfloat16
-        self.windows = PoseWindows(corpus, evenness=1.0)
+        self.windows = PoseWindows(corpus)
         self.longest = min(settings.window, int(int(self.windows.lengths.max()) / (1 + _TEMPO)) - 1)
         self.config = settings.find_config()
         super().__init__(settings, lambda: GeneratorNetwork(self.config, bfloat16=settings.bfloat16))
