@@ -21,6 +21,7 @@ from tyro.conf import arg
 
 from mapctl import kinematics, motion_dna, rotations
 from mapctl.errors import RequestError
+from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening.partial_motion import PartialMotion
 from mapctl.inbetweening.position_image import mirror_positions
 from mapctl.inbetweening.root_trajectory import LocalMotion, RootTrajectory, compute_displacement_errors
@@ -90,7 +91,7 @@ _ROLLS = 4096  # random numbers drawn at once
 _FIRST_LONGEST_GAP, _LONGEST_GAP = 30.0, 480.0  # frames when training begins, and grown up (paper: 600 at 60 fps)
 _SHORTEST_GAP = 30.0  # frames of the shortest longest gap of a sequence; the logarithm is drawn evenly
 _GROWN = 0.25  # share of training after which gaps grow no more
-_SPLICED_FROM = 90  # frames of the shortest gap with a splice, 3 s
+_SPLICED_FROM = 90  # frames of the shortest gap between keys of different clips, 3 s
 _RUNS, _RUN = 0.4, 12  # share of keys that are several frames, a pose and its pace, and their most frames
 _OPEN_ENDS = 0.1  # share of sequences that begin, and as many that end, without a key
 _SPEED = 1.5  # m/s, below which the hips travel where clips are spliced
@@ -103,7 +104,7 @@ class KeySequences:
 
     motion: PartialMotion  # poses by frame; between keys of different clips they are anything finite
     given: GivenParts  # known parts of the frames that are keys
-    truthful: Bool[Tensor, "batch frames"]  # whether the poses between the keys are a performer's
+    truthful: Bool[Tensor, "batch frames"]  # whether poses are a performer's: those of keys, and between keys of a clip
     clip: Int[Tensor, "batch frames"]  # number of the clip that a frame is of
     mirrored: Bool[Tensor, " batch"]  # whether left and right are exchanged
 
@@ -296,81 +297,32 @@ def draw_windows(
 def draw_splices(
     windows: PoseWindows, batch: int, frames: int, *, progress: float, generator: torch.Generator
 ) -> KeySequences:
-    """Draw keys of several clips: of one under 3 s, above that of another one the likelier the longer the gap is."""
+    """Draw keys each of which is of another clip, at distances that are proportional to the gaps, of 3 s at least."""
     rolls, longest = _roll(generator), find_longest_gap(progress)
     shape = (batch, frames)
     clip, time = (torch.zeros(shape, dtype=torch.long) for _ in range(2))
-    known, truthful = (torch.zeros(shape, dtype=torch.bool) for _ in range(2))
-    turn, shift = torch.zeros(shape), torch.zeros(*shape, 2)
+    known, turn, shift = torch.zeros(shape, dtype=torch.bool), torch.zeros(shape), torch.zeros(*shape, 2)
     for row in range(batch):
-        for part in _splice(windows, frames, longest, rolls, generator):
-            during, key = slice(part.start, None), slice(part.key, part.stop)
-            clip[row, during] = part.clip
-            time[row, during] = part.first + torch.arange(frames - part.start)
-            turn[row, during], shift[row, during] = part.turn, part.shift
-            known[row, key] = True
-            truthful[row, part.truthful_from : part.stop] = True
+        length, start, position = _draw_longest(longest, rolls), 0, torch.zeros(2)
+        while start < frames:
+            run = _draw_run(rolls)
+            number, first = (int(each) for each in windows.picker.pick(torch.tensor([run]), generator))
+            angle, at = torch.tensor(2 * math.pi * next(rolls)), int(windows.starts[number]) + first
+            begun, ended = rotations.rotate_ground(windows.ground[[at, at + run - 1]], angle.expand(2))
+            # The excerpt goes on until the next key, as nothing that counts.
+            clip[row, start:], time[row, start:] = number, first + torch.arange(frames - start)
+            turn[row, start:], shift[row, start:] = angle, position - begun
+            known[row, start : start + run] = True
+            gap = _draw_gap(length, rolls)
+            gap = gap if gap >= _SPLICED_FROM else gap + _SPLICED_FROM
+            travelled, towards = gap / PRIOR_FPS * _SPEED * next(rolls), 2 * math.pi * next(rolls)
+            position = position + ended - begun
+            position = position + travelled * torch.tensor([math.sin(towards), math.cos(towards)])
+            start += run - 1 + gap
     motion = windows.gather(clip, time.double())
     root = rotations.rotate_about_y(motion.root_position, turn) + rotations.lift_ground(shift)
     motion = replace(motion, root_position=root, heading=motion.heading + turn)
-    return _finish(motion, known, truthful, clip, rolls, generator)
-
-
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """A key, and the excerpt of a clip that it belongs to and that goes on until another part begins."""
-
-    clip: int
-    start: int  # frame of the sequence at which the excerpt begins
-    first: int  # and the clip's frame there
-    key: int  # frame of the sequence at which the key begins
-    stop: int  # and one past its end
-    truthful_from: int  # since when the sequence is the clip
-    turn: float  # of the excerpt about +Y, radians
-    shift: Float[Tensor, " 2"]  # and over the ground, metres, behind the turn
-
-    def time_at(self, frame: int) -> int:
-        return self.first + frame - self.start
-
-
-def _splice(
-    windows: PoseWindows, frames: int, longest: float, rolls: Iterator[float], generator: torch.Generator
-) -> Iterator[_Part]:
-    """Yield the keys of a sequence in temporal order."""
-    length = _draw_longest(longest, rolls)
-    part = _begin(windows, rolls, generator)
-    while part.key < frames:
-        yield part
-        gap = _draw_gap(length, rolls)
-        last = part.stop - 1
-        room = int(windows.lengths[part.clip]) - 1 - part.time_at(last)
-        other = next(rolls) < gap / _LONGEST_GAP if gap >= _SPLICED_FROM else gap > room
-        if other or gap > room:
-            gap = gap if gap >= _SPLICED_FROM else gap + _SPLICED_FROM
-            part = _leave(windows, part, gap, rolls, generator)
-        else:
-            stop = last + gap + min(_draw_run(rolls), room - gap + 1)
-            part = replace(part, key=last + gap, stop=stop, truthful_from=last)
-
-
-def _begin(windows: PoseWindows, rolls: Iterator[float], generator: torch.Generator) -> _Part:
-    run = _draw_run(rolls)
-    clip, first = (int(each) for each in windows.picker.pick(torch.tensor([run]), generator))
-    turn = 2 * math.pi * next(rolls)
-    shift = -rotations.rotate_ground(windows.ground[windows.starts[clip] + first], torch.tensor(turn))
-    return _Part(clip, 0, first, 0, run, 0, turn, shift)
-
-
-def _leave(windows: PoseWindows, part: _Part, gap: int, rolls: Iterator[float], generator: torch.Generator) -> _Part:
-    """Go on with another clip after so many frames, at a distance that is proportional to them."""
-    new, last = _begin(windows, rolls, generator), part.stop - 1
-    before = windows.starts[part.clip] + part.time_at(last)
-    position = rotations.rotate_ground(windows.ground[before], torch.tensor(part.turn)) + part.shift
-    travelled = gap / 30 * _SPEED * next(rolls)
-    towards = 2 * math.pi * next(rolls)
-    shift = new.shift + position + travelled * torch.tensor([math.sin(towards), math.cos(towards)])
-    start = last + gap
-    return replace(new, start=start, key=start, stop=start + new.stop, truthful_from=start, shift=shift)
+    return _finish(motion, known, known, clip, rolls, generator)
 
 
 def _lay_keys(frames: int, longest: float, rolls: Iterator[float]) -> Iterator[tuple[int, int]]:
