@@ -94,11 +94,8 @@ class Card:
     abilities: dict[str, float] = field(default_factory=dict)
     """Limits of speed (m/s) and turning (rad/s) that the data show, by their names in `DataLimits`."""
 
-    def __str__(self) -> str:
-        return f"Card: {self.kind}, {self.licence or 'without a licence'}"
-
     def __repr__(self) -> str:
-        return f"<{self}>"
+        return f"<Card: {self.kind}, {self.licence or 'without a licence'}>"
 
 
 class LoadedModel:
@@ -113,11 +110,8 @@ class LoadedModel:
         """Return the fields alone for a pickle or a copy, which computes again what is cached."""
         return {field.name: getattr(self, field.name) for field in fields(self)}  # pyright: ignore[reportArgumentType]
 
-    def __str__(self) -> str:
-        return f"{type(self).__name__}: {self.name}, {self.card.licence or 'without a licence'}"
-
     def __repr__(self) -> str:
-        return f"<{self}>"
+        return f"<{type(self).__name__}: {self.name}, {self.card.licence or 'without a licence'}>"
 
 
 @dataclass(frozen=True, eq=False, repr=False)

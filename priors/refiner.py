@@ -41,11 +41,6 @@ def compute_end_effectors(
     return rotations.rotate_about_y(vectors, -trial.heading[:, 1:, None]).flatten(2)
 
 
-def count_channels(joints: Sequence[str]) -> int:
-    """Count the width of `compute_end_effectors`."""
-    return 6 * len(joints)
-
-
 END_EFFECTORS = (
     "hips",
     "head",
@@ -105,7 +100,7 @@ class RefinerNetwork(nn.Module):
         `reach_std` (channels,); RuntimeError for other widths."""
         super().__init__()
         self.config = config
-        reach = count_channels(config.joints)
+        reach = 6 * len(config.joints)
         for name, width in (("mean", LAYOUT.size), ("std", LAYOUT.size), ("reach_mean", reach), ("reach_std", reach)):
             self.register_buffer(name, statistics.get(name, torch.ones(())).expand(width).clone())
         seen = 2 * config.lookahead + 1

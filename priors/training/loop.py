@@ -228,18 +228,13 @@ class NetworkSettings(Settings):
         if self.init is not None and any(getattr(self, name, None) for name in self.shape_options):
             raise RequestError("with --init the network is that model's; options of its shape do not apply")
 
-    def make_config(self) -> Any:
-        """Return the shape of the network that these settings ask for."""
-        config: Any = self.papers if getattr(self, "paper", False) else self.ours
-        given = {name: getattr(self, name) for name in self.shape_options if name != "paper"}
-        changes = {name: value for name, value in given.items() if value is not None}
-        return type(config).of_card(config.as_card() | changes)
-
     def find_config(self) -> Any:
-        """Return the shape of the network: that of the initial model, where there is one."""
-        asked, card = self.shape or self.make_config(), self.init_card
-        if card is None:
-            return asked
+        """Return the shape of the network: that of the initial model, where there is one, else what is asked for."""
+        asked: Any = self.shape or (self.papers if getattr(self, "paper", False) else self.ours)
+        if (card := self.init_card) is None:
+            given = {name: getattr(self, name) for name in self.shape_options if name != "paper"}
+            given = {name: value for name, value in given.items() if value is not None}
+            return type(asked).of_card(asked.as_card() | given)
         if card.kind != self.kind:
             raise CheckpointError(f"{self.init} holds a {card.kind}, not a {self.kind}")
         return type(asked).of_card(card.config)

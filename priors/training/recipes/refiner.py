@@ -46,7 +46,6 @@ _WARM_UP = 75  # updates of each before the rounds (section 4.2.2)
 # Updates of the critic before anything else (the paper's 0): a refiner led by a critic that has learnt nothing harms
 # samples that were nearly good.
 _HEAD_START = 200
-_CRITIC_WIDTH = 128  # units of the critic's layers (the paper's 500)
 _CRITIC_UPDATES = 2  # updates of the critic in each round (the paper's 1)
 _REFINER_UPDATES = 1  # initial updates of the refiner in each round (the paper's 5); doubled and halved as either wins
 _STRONG, _WEAK = 0.01, 1.0  # critic's loss below which the refiner's updates are doubled, and above which halved
@@ -54,8 +53,6 @@ _MOST_UPDATES = 20  # they are never more than this
 _HISTORY = 320  # refined windows kept for the critic
 _ROOT = 20.0  # weight of the squared distance between the root trajectories before and after (Eq. 13), per m^2
 _REFINER_RATE, _CRITIC_RATE = 1e-4, 5e-4  # learning rates (the paper's 0.002 and 0.005)
-_CRITIC_AROUND = 2  # frames on either side that its first layer sees (the paper's 0): jitter takes three frames
-_CRITIC_SLOW = 0.05  # ground speed of feet, m/s, below which the critic sees it magnified
 _MOMENTS = 10.0  # weight of feet, jerk and spread: the critic alone lets feet slide while it is still learning
 _AVERAGE = 0.99  # share of the past in the running mean of the refiner's weights, which is what is kept
 
@@ -139,12 +136,7 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
         statistics = compute_statistics(corpus, self.config, settings.window)
         reach = {name: statistics[name] for name in ("reach_mean", "reach_std")}
         self.refiner, self.critic = draw_weights(
-            lambda: (
-                RefinerNetwork(self.config, **statistics),
-                EndEffectorCritic(
-                    self.config.joints, width=_CRITIC_WIDTH, around=_CRITIC_AROUND, slow=_CRITIC_SLOW, **reach
-                ),
-            ),
+            lambda: (RefinerNetwork(self.config, **statistics), EndEffectorCritic(self.config.joints, **reach)),
             settings.seed,
         )
         self.network = deepcopy(self.refiner).requires_grad_(False)
