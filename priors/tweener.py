@@ -31,7 +31,6 @@ from mapctl.inbetweening.root_trajectory import TREMBLE_HZ, LocalMotion, lead_ov
 from mapctl.inbetweening.whole_body import bend_limbs
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
-from mapctl.motion_dna import MotionDna
 from mapctl.numerics.intervals import count_frames_to_observed, true_intervals
 from mapctl.numerics.smooth_offsets import interpolate_turns, smooth_between
 from mapctl.protocols import Inbetweener, PathPredictor
@@ -414,7 +413,7 @@ class Style:
     vector: Float[Tensor, " style"]
     """Its encoding by the style encoder."""
     poses: Float[Tensor, "poses joints 3"] | None = None
-    """Poses of it, as `MotionDna` holds them; None for a class."""
+    """Poses of it, as `mapctl.motion_dna` takes them; None for a class."""
 
 
 def mix_styles(styles: Sequence[Style]) -> Style:
@@ -432,7 +431,7 @@ def mix_styles(styles: Sequence[Style]) -> Style:
 def draw_style(
     styles: Sequence[Style],
     number: int,
-    encode: Callable[[MotionDna, str], Style],
+    encode: Callable[[Float[Tensor, "poses joints 3"], str], Style],
     *,
     order: Sequence[int],
     generator: torch.Generator,
@@ -446,7 +445,7 @@ def draw_style(
     if base.poses is not None:
         count = max(1, len(base.poses) // 2)
         chosen = torch.randperm(len(base.poses), generator=generator)[:count]
-        return encode(MotionDna(base.poses[chosen]), f"{base.name}, {count} of its poses")
+        return encode(base.poses[chosen], f"{base.name}, {count} of its poses")
     others = [style for style in styles if style is not base]
     if not others:
         raise RequestError(f"the class {base.name} alone leaves nothing to vary; name more classes or motion files")
@@ -470,11 +469,13 @@ def find_class(clip: str, labels: str = LABELS) -> str | None:
 
 
 @torch.no_grad()
-def encode_classes(encoder: StyleEncoder, classes: Mapping[str, Sequence[MotionDna]]) -> dict[str, Any]:
+def encode_classes(
+    encoder: StyleEncoder, classes: Mapping[str, Sequence[Float[Tensor, "poses joints 3"]]]
+) -> dict[str, Any]:
     """Encode classes for the data of a card: by name the number of clips, and the mean of their vectors."""
     encoded = {}
     for name in sorted(classes):
-        each = torch.stack([encoder(dna.poses[None])[0] for dna in classes[name]])
+        each = torch.stack([encoder(dna[None])[0] for dna in classes[name]])
         half = each.mean(dim=0).numpy().astype("<f2")
         encoded[name] = {"clips": len(each), "vector": base64.b64encode(half.tobytes()).decode("ascii")}
     return {_FIELD: encoded}
@@ -618,7 +619,7 @@ class Tweener(checkpoints.NetworkModel[GeneratorNetwork], Inbetweener):
         """Its name in notes."""
         return SOURCE if self.style is None else f"{SOURCE} in the style of {self.style.name}"
 
-    def styled(self, dna: MotionDna) -> "Tweener":
+    def styled(self, dna: Float[Tensor, "poses joints 3"]) -> "Tweener":
         """Return the in-betweener that moves as a motion of which these are poses."""
         return self.in_style(self.encode_style(dna))
 
@@ -627,9 +628,9 @@ class Tweener(checkpoints.NetworkModel[GeneratorNetwork], Inbetweener):
         return replace(self, style=style)
 
     @torch.no_grad()
-    def encode_style(self, dna: MotionDna, name: str = "motion DNA") -> Style:
+    def encode_style(self, dna: Float[Tensor, "poses joints 3"], name: str = "motion DNA") -> Style:
         """Encode poses of a motion as a style of this name."""
-        return Style(name, self.network.style(dna.poses[None])[0], dna.poses)
+        return Style(name, self.network.style(dna[None])[0], dna)
 
     @torch.no_grad()
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:

@@ -26,7 +26,6 @@ from mapctl.inbetweening.partial_motion import PartialMotion
 from mapctl.inbetweening.position_image import mirror_positions
 from mapctl.inbetweening.root_trajectory import LocalMotion, RootTrajectory, compute_displacement_errors
 from mapctl.metrics.body import see_from_hips
-from mapctl.motion_dna import MotionDna
 from mapctl.numerics.intervals import last_observed, next_observed, true_intervals
 from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
@@ -529,9 +528,9 @@ CLIPS_OF_CLASS = 24
 """Clips of a class that its vector is the mean of, at most: evenly among all of them by name."""
 
 
-def collect_dna(corpus: Corpus, labels: str = LABELS) -> Mapping[str, Sequence[MotionDna]]:
+def collect_dna(corpus: Corpus, labels: str = LABELS) -> Mapping[str, Sequence[Float[Tensor, "poses joints 3"]]]:
     """Collect the poses of clips by class; RequestError for labels of one's own that no clip has."""
-    clips, found = corpus.clips(), dict[str, list[MotionDna]]()
+    clips, found = corpus.clips(), dict[str, list[Tensor]]()
     for name, numbers in group_clips(corpus.names, labels).items():
         taken = min(len(numbers), CLIPS_OF_CLASS)
         poses = [BodyPose.of_features_in_place(clips[numbers[at * len(numbers) // taken]]) for at in range(taken)]
