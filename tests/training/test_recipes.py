@@ -28,7 +28,7 @@ from priors.path import PathNetwork
 from priors.training import gaps
 from priors.training.critics import FREE_RUN_MOMENTS, HistoryBuffer, MomentWeights, moment_loss, show
 from priors.training.data import Corpus, compute_feature_statistics, find_window_starts
-from priors.training.recipes import tweener
+from priors.training.recipes import pose_transformer, tweener
 from priors.training.recipes.denoiser import compute_denoiser_losses, draw_performers
 from priors.training.recipes.infiller import compute_infiller_losses
 from priors.training.recipes.keyframe_timing import solve_weights
@@ -364,3 +364,9 @@ def test_windows_are_evened_among_top_folders(evenness, share):
     clips = Corpus(("one/a", "two/b"), (919, 119), corpus(1, 1038).features)
     drawn = FeatureWindows(clips, 20, evenness=evenness).draw(4000, generator()).first
     assert float((drawn < 919).double().mean()) == pytest.approx(share, abs=0.03)
+
+
+def test_spreads_are_calibrated_on_clips_a_little_longer_than_a_window(monkeypatch):
+    monkeypatch.setattr(pose_transformer, "_CALIBRATED_WINDOWS", 60)
+    network, clips = tiny_transformer.network(), Corpus(("a",), (95,), corpus(1, 95).features)
+    assert all(bool(over.isfinite().all()) for over in pose_transformer._measure_spread(network, clips, seed=1))

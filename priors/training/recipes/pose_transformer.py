@@ -23,7 +23,7 @@ from priors.training.augment import Draws
 from priors.training.data import Corpus, Split
 from priors.training.gaps import InbetweenerTrainer
 from priors.training.loop import Count, Export, NetworkSettings, Number, make_adam, make_generator
-from priors.training.windows import PoseVariation, PoseWindows, add_targets, draw_length, measure_lengths
+from priors.training.windows import TEMPO, PoseVariation, PoseWindows, add_targets, draw_length, measure_lengths
 
 _SHORTEST_WINDOW = 8  # frames
 _CALIBRATED_WINDOWS, _CALIBRATED_FRAMES = 128, (10, 20, 40, 60, 90)
@@ -124,7 +124,7 @@ def _measure_spread(network: PoseTransformerNetwork, corpus: Corpus, seed: int) 
     generator, windows = make_generator(seed), PoseWindows(corpus)
     found: list[Tensor] = []
     for frames in _CALIBRATED_FRAMES:
-        if frames <= int(windows.lengths.max()):
+        if frames * (1 + TEMPO) < int(windows.lengths.max()):
             truth = add_targets(windows.draw(_CALIBRATED_WINDOWS, frames, generator, variation=PoseVariation()))
             shown = hide(network, sample_known_parts(truth, generator))
             proposed = network(shown)
