@@ -2,9 +2,6 @@
 appendix D).
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -22,16 +19,9 @@ _APART = PRIOR_FPS // 2  # frames between two of them, in a motion that is long 
 _LEAP = 3.0  # times as far as in any other frame: from the T-pose before a take to its first frame
 
 
-@dataclass(frozen=True, eq=False)
-class MotionDna:
-    """Representative poses, in no order."""
-
-    poses: Float[Tensor, "poses joints 3"]
-    """Positions of canonical joints from the hips without the hips' rotation, metres, on canonical bones."""
-
-
-def of(motion: Motion, count: int = POSES, *, rig: Rig | None = None) -> MotionDna:
-    """Take poses of a motion on any known rig: frames in which joints turn fastest, apart in time (appendix D).
+def of(motion: Motion, count: int = POSES, *, rig: Rig | None = None) -> Float[Tensor, "poses joints 3"]:
+    """Take poses of a motion on any known rig, in no order: frames in which joints turn fastest, apart in time
+    (appendix D). They are positions of canonical joints from the hips without the hips' rotation, metres.
 
     RequestError for less than one pose, for a motion without frames, and for an unknown rig.
     """
@@ -46,12 +36,14 @@ def of(motion: Motion, count: int = POSES, *, rig: Rig | None = None) -> MotionD
     return of_rotations(quats, count)
 
 
-def of_rotations(local_quat_xyzw: Float[Tensor, "frames joints 4"], count: int = POSES) -> MotionDna:
+def of_rotations(
+    local_quat_xyzw: Float[Tensor, "frames joints 4"], count: int = POSES
+) -> Float[Tensor, "poses joints 3"]:
     """Take poses of local rotations of canonical joints at PRIOR_FPS, as `of` does; the hips' own do not matter."""
     upright = local_quat_xyzw.clone()
     upright[:, 0] = upright.new_tensor([0.0, 0.0, 0.0, 1.0])
     chosen = upright[choose_frames(upright, count)]
-    return MotionDna(kinematics.positions_from_matrices(CANONICAL, rotations.to_matrix(chosen)).float())
+    return kinematics.positions_from_matrices(CANONICAL, rotations.to_matrix(chosen)).float()
 
 
 def choose_frames(local_quat_xyzw: Float[Tensor, "frames joints 4"], count: int) -> Int[Tensor, " chosen"]:
@@ -71,10 +63,3 @@ def _measure_turns(local_quat_xyzw: Float[Tensor, "frames joints 4"]) -> Float[T
     """Measure how far joints turn from frame to frame, mean over joints, radians."""
     change = rotations.multiply(rotations.inverse(local_quat_xyzw[:-1]), local_quat_xyzw[1:])
     return rotations.to_rotation_vector(change).norm(dim=-1).mean(dim=-1)
-
-
-def join(parts: Sequence[MotionDna]) -> MotionDna:
-    """Return the poses of several motions; RequestError for none."""
-    if not parts:
-        raise RequestError("motion DNA needs at least one motion")
-    return MotionDna(torch.cat([part.poses for part in parts]))

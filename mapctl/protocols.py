@@ -167,18 +167,9 @@ class Density(Protocol[State]):
         ...
 
     @abstractmethod
-    def log_prob(
-        self,
-        features: Float[Tensor, "batch frames size"],
-        state: State,
-        *,
-        inputs: Float[Tensor, "batch frames size"] | None = None,
-    ) -> Float[Tensor, "batch frames"]:
+    def log_prob(self, features: Float[Tensor, "batch frames size"], state: State) -> Float[Tensor, "batch frames"]:
         """Compute the log density of each frame given those before it, contact bits included; differentiable in both.
-
-        In nats, of features divided by `feature_std`. Where `inputs` are given, each frame is conditioned on
-        them instead of on the features (teacher forcing with noise), which are scored alone.
-        """
+        In nats, of features divided by `feature_std`."""
         ...
 
     @abstractmethod

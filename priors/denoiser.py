@@ -22,7 +22,7 @@ from mapctl.pose import BodyPose
 from mapctl.recording import Capture, CaptureProposal
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
-from priors.checkpoints import NetworkConfig
+from priors.checkpoints import NetworkConfig, Size, Sizes
 
 _NON_ROOT_JOINTS = CANONICAL.num_joints - 1
 _ANGLE_CHANNELS = 2 + 3 * _NON_ROOT_JOINTS  # tilt and rotation vectors
@@ -46,16 +46,16 @@ class DenoiserConfig(NetworkConfig):
 
     FIXED: ClassVar = {"plain": False, "sees_world": True}
 
-    width: int = 192
+    width: Size = 192
     """Channels of the hidden layers."""
-    kernel: int = 5
+    kernel: Size = 5
     """Frames that one convolution sees."""
-    dilations: tuple[int, ...] = (1, 2, 4, 8, 1, 2, 4, 8)
+    dilations: Sizes = (1, 2, 4, 8, 1, 2, 4, 8)
     """Dilation of each residual block, frames."""
 
     def __post_init__(self):
-        if self.width < 1 or self.kernel < 1 or self.kernel % 2 == 0 or min(self.dilations, default=0) < 1:
-            raise RequestError(f"a denoiser needs a positive width, an odd kernel and positive dilations, got {self}")
+        if self.kernel % 2 == 0:
+            raise RequestError(f"a denoiser's kernel must be odd, got {self.kernel}")
 
 
 class DenoiserNetwork(nn.Module):

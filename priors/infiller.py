@@ -16,7 +16,7 @@ from mapctl.numerics.intervals import count_frames_to_observed
 from mapctl.protocols import Inbetweener
 from mapctl.skeleton import CANONICAL
 from priors import checkpoints
-from priors.checkpoints import NetworkConfig
+from priors.checkpoints import NetworkConfig, Size, Sizes
 
 Architecture = Literal["skips", "image"]
 _LEAK = 0.2
@@ -112,7 +112,7 @@ _JOINTS = CANONICAL.num_joints
 _POSITION_ROWS, _REFERENCE_ROWS, _CONTACT_ROWS = 3 * _JOINTS, 3, 2
 IMAGE_ROWS = _POSITION_ROWS + _REFERENCE_ROWS + _CONTACT_ROWS
 """Rows of an image: joint positions, the reference's velocities, contacts."""
-_MASK_ROWS = _JOINTS + 1 + 2  # known, present, frames since and until any joint is known
+_MASK_ROWS = _JOINTS + 1 + 2  # known, one, frames since and until any joint is known
 _VELOCITY_UNIT, _HEADING_UNIT = 0.05, 0.05  # one unit of the reference's velocities: metres and radians a frame
 _MAX_FRAMES_SINCE = 60  # frames beyond which it is all one how far a known frame is
 
@@ -123,14 +123,14 @@ class InfillerConfig(NetworkConfig):
 
     architecture: Architecture = "skips"
     """Architecture: `skips` is ours, which keeps what is known, `image` that of Kaufmann et al. 2020."""
-    widths: tuple[int, ...] = (128, 160, 192, 256, 256)
+    widths: Sizes = (128, 160, 192, 256, 256)
     """Channels of the units of `skips`; those of `image` are fixed."""
-    kernel: int = 3
+    kernel: Size = 3
     """Width of a convolution of `skips`, frames."""
 
     def __post_init__(self):
-        if min(self.widths, default=0) < 1 or self.kernel < 1 or self.kernel % 2 == 0:
-            raise RequestError(f"an infiller needs positive widths and an odd kernel, got {self}")
+        if self.kernel % 2 == 0:
+            raise RequestError(f"an infiller's kernel must be odd, got {self.kernel}")
 
 
 class InfillerNetwork(nn.Module):
@@ -161,7 +161,7 @@ class InfillerNetwork(nn.Module):
         if self.keeps_observed:
             # Which joints are known, and how many frames ago and ahead any is, as a share of those that matter.
             far = count_frames_to_observed(image.known.any(dim=-1)).clamp(max=_MAX_FRAMES_SINCE) / _MAX_FRAMES_SINCE
-            masks = (image.known, image.present[..., None], far)
+            masks = (image.known, torch.ones_like(far[..., :1]), far)  # frames, beside what a convolution pads
             rows = torch.cat([rows, *(each.to(rows) for each in masks)], dim=-1)
         with torch.autocast(rows.device.type, torch.bfloat16, enabled=self.reduced_precision):
             out = self.net(rows.transpose(1, 2)).transpose(1, 2).to(rows.dtype)
@@ -178,7 +178,6 @@ class InfillerNetwork(nn.Module):
         positions = (shown - self.mean) / self.std
         if not self.keeps_observed:
             positions = positions * image.known[..., None]
-        positions = positions * image.present[..., None, None]
         step = torch.diff(image.ground, dim=1, prepend=image.ground[:, :1])
         step = rotations.rotate_ground(step, -image.heading) / _VELOCITY_UNIT
         turn = torch.diff(image.heading, dim=1, prepend=image.heading[:, :1])[..., None] / _HEADING_UNIT

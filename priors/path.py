@@ -10,12 +10,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool1d, pad
 
-from mapctl.errors import RequestError
 from mapctl.inbetweening.root_trajectory import LocalMotion, RootTrajectory
 from mapctl.protocols import PathPredictor
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOE_REST_HEIGHT
 from priors import checkpoints
-from priors.checkpoints import NetworkConfig
+from priors.checkpoints import NetworkConfig, Size
 
 
 class ResidualConv(nn.Module):
@@ -96,12 +95,8 @@ _STRIDE = 16  # frames of the input to one of the innermost layers
 class PathConfig(NetworkConfig):
     """Shape of the network."""
 
-    width: int = 64
+    width: Size = 64
     """Channels of the outer layers, 128 in the paper; the inner ones have twice as many."""
-
-    def __post_init__(self):
-        if self.width < 1:
-            raise RequestError(f"a path predictor needs a positive width, got {self.width}")
 
 
 class PathNetwork(nn.Module):

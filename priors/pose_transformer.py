@@ -26,7 +26,7 @@ from mapctl.numerics.smooth_offsets import blend_seams_in_positions, blend_seams
 from mapctl.protocols import Inbetweener
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors import checkpoints
-from priors.checkpoints import NetworkConfig
+from priors.checkpoints import NetworkConfig, Size
 
 _JOINTS = CANONICAL.num_joints
 _ROTATION_ROWS = 6 * _JOINTS
@@ -47,22 +47,22 @@ QUANTILES = (0.5, 0.9)
 class PoseTransformerConfig(NetworkConfig):
     """Shape of the network."""
 
-    width: int = 192
+    width: Size = 192
     """Numbers of a token; a multiple of twice the heads."""
-    layers: int = 3
+    layers: Size = 3
     """Layers of attention of the first stage, to frames alone in which a rotation, the hips' position or a target is
     known (context and detail transformer of Qin et al. 2022, with this network's tokens, rotary positions and losses).
     """
-    heads: int = 6
+    heads: Size = 6
     """Heads of each."""
-    kernel: int = 5
+    kernel: Size = 5
     """Frames of each layer's convolution, one number at a time, before its attention; odd."""
-    detail: int = 3
+    detail: Size = 3
     """Layers of attention of the second stage, which corrects what the first proposes."""
 
     def __post_init__(self):
-        if min(self.width, self.layers, self.heads, self.detail) < 1 or self.width % (2 * self.heads):
-            raise RequestError(f"a pose transformer needs layers and a width of whole pairs a head, got {self}")
+        if self.width % (2 * self.heads):
+            raise RequestError(f"a pose transformer needs a width of whole pairs a head, got {self}")
         if self.kernel % 2 == 0:
             raise RequestError(f"a pose transformer's kernel must be odd, got {self.kernel}")
 

@@ -10,9 +10,11 @@ is where a viewer looks (section 4.2.1).
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
+from pydantic import Field
 from torch import Tensor, nn
 
 from mapctl import rotations
@@ -22,7 +24,7 @@ from mapctl.protocols import Refiner
 from mapctl.skeleton import CANONICAL
 from mapctl.terms.trial import Trial
 from priors import checkpoints
-from priors.checkpoints import NetworkConfig
+from priors.checkpoints import NetworkConfig, Size
 
 
 def compute_end_effectors(
@@ -37,11 +39,6 @@ def compute_end_effectors(
     position = world[:, 1:] - rotations.lift_ground(trial.root_xz_world[:, 1:, None])
     vectors = torch.cat([position, velocity], dim=2)
     return rotations.rotate_about_y(vectors, -trial.heading[:, 1:, None]).flatten(2)
-
-
-def count_channels(joints: Sequence[str]) -> int:
-    """Count the width of `compute_end_effectors`."""
-    return 6 * len(joints)
 
 
 END_EFFECTORS = (
@@ -68,20 +65,18 @@ _CHUNK_FRAMES = 600  # frames refined at once
 class RefinerConfig(NetworkConfig):
     """Shape of the network."""
 
-    width: int = 256
+    width: Size = 256
     """Units of the first layer (Wang et al. 2019: 500)."""
-    memory: int = 256
+    memory: Size = 256
     """Units of the LSTM (Wang et al. 2019: 1000)."""
-    lookahead: int = 4
+    lookahead: Annotated[int, Field(ge=0, le=64)] = 4
     """Frames ahead, and behind, that the first layer sees; Wang et al. 2019: 0."""
-    limit: float = 2.0
+    limit: Annotated[float, Field(gt=0)] = 2.0
     """Bound of what is added, standard deviations of each feature."""
     joints: tuple[str, ...] = END_EFFECTORS
     """Names of the joints whose positions and velocities are inputs."""
 
     def __post_init__(self):
-        if min(self.width, self.memory) < 1 or self.lookahead < 0 or not self.limit > 0:
-            raise RequestError(f"a refiner needs positive width, memory and limit, and lookahead >= 0, got {self}")
         if not self.joints or not set(self.joints) <= set(CANONICAL.names):
             raise RequestError(f"a refiner needs end effectors among {', '.join(CANONICAL.names)}, got {self.joints}")
 
@@ -105,7 +100,7 @@ class RefinerNetwork(nn.Module):
         `reach_std` (channels,); RuntimeError for other widths."""
         super().__init__()
         self.config = config
-        reach = count_channels(config.joints)
+        reach = 6 * len(config.joints)
         for name, width in (("mean", LAYOUT.size), ("std", LAYOUT.size), ("reach_mean", reach), ("reach_std", reach)):
             self.register_buffer(name, statistics.get(name, torch.ones(())).expand(width).clone())
         seen = 2 * config.lookahead + 1

@@ -49,7 +49,7 @@ from mapctl.protocols import Inbetweener
 from mapctl.runtime.stepwise import StepwiseWork
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors import checkpoints
-from priors.checkpoints import NetworkConfig
+from priors.checkpoints import NetworkConfig, Size, Sizes
 
 SIDES = 2
 """Forward and backward."""
@@ -151,27 +151,27 @@ class StitcherConfig(NetworkConfig):
 
     FIXED: ClassVar = {"without": ["d"], "printed": False}
 
-    embedding: tuple[int, ...] = (192, 192, 96)
+    embedding: Sizes = (192, 192, 96)
     """Layers of the encoders of state, offset and target; the last is even."""
-    encoder: int = 192
+    encoder: Size = 192
     """Width of the encoder LSTM."""
-    head: int = 128
+    head: Size = 128
     """Width of the layer before the distributions."""
-    shared: int = 16
+    shared: Size = 16
     """Numbers of the latent that both sides share over a transition."""
-    own: int = 4
+    own: Size = 4
     """Numbers of the latent of each frame."""
-    decoder: int = 256
+    decoder: Size = 256
     """Width of the decoder LSTM."""
-    experts: int = 4
+    experts: Size = 4
     """Experts that the phase gates."""
-    expert: tuple[int, ...] = (224, 160)
+    expert: Sizes = (224, 160)
     """Hidden layers of an expert."""
-    gate: tuple[int, ...] = (64, 32)
+    gate: Sizes = (64, 32)
     """Hidden layers of the gate."""
-    phase: int = 128
+    phase: Size = 128
     """Width of the two hidden layers of the phase's networks."""
-    longest: int = 61
+    longest: Size = 61
     """Frames from one pose to the other in the longest transition."""
 
     def __post_init__(self):

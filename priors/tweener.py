@@ -31,13 +31,12 @@ from mapctl.inbetweening.root_trajectory import TREMBLE_HZ, LocalMotion, lead_ov
 from mapctl.inbetweening.whole_body import bend_limbs
 from mapctl.kinematics import heading
 from mapctl.motion import Motion
-from mapctl.motion_dna import MotionDna
 from mapctl.numerics.intervals import count_frames_to_observed, true_intervals
 from mapctl.numerics.smooth_offsets import interpolate_turns, smooth_between
 from mapctl.protocols import Inbetweener, PathPredictor
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOE_REST_HEIGHT
 from priors import checkpoints
-from priors.checkpoints import Card, NetworkConfig
+from priors.checkpoints import Card, NetworkConfig, Size, Sizes
 from priors.path import ConvPathPredictor, ResidualConv
 
 _SAMPLES = 129  # of a curve, to tell how long it is
@@ -160,7 +159,6 @@ def make_key_image(motion: PartialMotion, given: GivenParts) -> PositionImage:
         heading,
         see_contacts(motion.contacts, given.known),
         known=given.axes.all(dim=-1),
-        present=torch.ones_like(given.heading),
         known_axes=given.axes,
     )
 
@@ -234,21 +232,19 @@ class GeneratorConfig(NetworkConfig):
 
     FIXED: ClassVar = {"keys": "dense", "architecture": "two-stage"}
 
-    widths: tuple[int, ...] = (96, 128, 192, 256, 288, 288)
+    widths: Sizes = (96, 128, 192, 256, 288, 288)
     """Channels of the encoder's layers, each of which halves the frames."""
-    up_widths: tuple[int, ...] = (288, 288, 256, 192, 128, 96)
+    up_widths: Sizes = (288, 288, 256, 192, 128, 96)
     """Channels of the decoder's stages, each of which doubles them."""
-    style: int = 128
+    style: Size = 128
     """Numbers of the vector that a motion's style becomes."""
     skips: bool = True
     """Whether the decoder's stages also see the style, and what the encoder was given at their rate, which the paper's
     do not."""
 
     def __post_init__(self):
-        if len(self.widths) != _STAGES or len(self.up_widths) != _STAGES or min(*self.widths, *self.up_widths) < 1:
-            raise RequestError(f"a generator needs {_STAGES} positive widths down and as many up, got {self}")
-        if self.style < 1:
-            raise RequestError(f"a generator needs a style of at least one number, got {self.style}")
+        if len(self.widths) != _STAGES or len(self.up_widths) != _STAGES:
+            raise RequestError(f"a generator needs {_STAGES} widths down and as many up, got {self}")
 
 
 PAPER = GeneratorConfig((384, 384, 512, 512, 768, 1024), (1024, 768, 768, 512, 512, 512), style=1024, skips=False)
@@ -361,8 +357,7 @@ class GeneratorNetwork(nn.Module):
         step = rotations.rotate_ground(step, -image.heading) / _VELOCITY_UNIT
         turn = torch.diff(image.heading, dim=1, prepend=image.heading[:, :1])[..., None] / _HEADING_UNIT
         parts = [positions.flatten(-2), distances.flatten(-2), step, turn, times]
-        rows = torch.cat([*parts, 2 * image.contacts - 1], dim=-1)
-        return rows * image.present[..., None].to(rows)
+        return torch.cat([*parts, 2 * image.contacts - 1], dim=-1)
 
 
 class _Affine(nn.Module):
@@ -418,7 +413,7 @@ class Style:
     vector: Float[Tensor, " style"]
     """Its encoding by the style encoder."""
     poses: Float[Tensor, "poses joints 3"] | None = None
-    """Poses of it, as `MotionDna` holds them; None for a class."""
+    """Poses of it, as `mapctl.motion_dna` takes them; None for a class."""
 
 
 def mix_styles(styles: Sequence[Style]) -> Style:
@@ -436,7 +431,7 @@ def mix_styles(styles: Sequence[Style]) -> Style:
 def draw_style(
     styles: Sequence[Style],
     number: int,
-    encode: Callable[[MotionDna, str], Style],
+    encode: Callable[[Float[Tensor, "poses joints 3"], str], Style],
     *,
     order: Sequence[int],
     generator: torch.Generator,
@@ -450,7 +445,7 @@ def draw_style(
     if base.poses is not None:
         count = max(1, len(base.poses) // 2)
         chosen = torch.randperm(len(base.poses), generator=generator)[:count]
-        return encode(MotionDna(base.poses[chosen]), f"{base.name}, {count} of its poses")
+        return encode(base.poses[chosen], f"{base.name}, {count} of its poses")
     others = [style for style in styles if style is not base]
     if not others:
         raise RequestError(f"the class {base.name} alone leaves nothing to vary; name more classes or motion files")
@@ -474,11 +469,13 @@ def find_class(clip: str, labels: str = LABELS) -> str | None:
 
 
 @torch.no_grad()
-def encode_classes(encoder: StyleEncoder, classes: Mapping[str, Sequence[MotionDna]]) -> dict[str, Any]:
+def encode_classes(
+    encoder: StyleEncoder, classes: Mapping[str, Sequence[Float[Tensor, "poses joints 3"]]]
+) -> dict[str, Any]:
     """Encode classes for the data of a card: by name the number of clips, and the mean of their vectors."""
     encoded = {}
     for name in sorted(classes):
-        each = torch.stack([encoder(dna.poses[None])[0] for dna in classes[name]])
+        each = torch.stack([encoder(dna[None])[0] for dna in classes[name]])
         half = each.mean(dim=0).numpy().astype("<f2")
         encoded[name] = {"clips": len(each), "vector": base64.b64encode(half.tobytes()).decode("ascii")}
     return {_FIELD: encoded}
@@ -490,7 +487,7 @@ def read_classes(card: Card, size: int) -> dict[str, Style]:
     for name, given in card.data.get(_FIELD, {}).items():
         try:
             vector = np.frombuffer(base64.b64decode(given["vector"], validate=True), "<f2").astype(np.float32)
-        except (KeyError, TypeError, ValueError) as error:
+        except ValueError as error:
             raise CheckpointError(f"the class {name} in the card holds no vector ({error})") from error
         if len(vector) != size or not np.isfinite(vector).all():
             raise CheckpointError(f"the class {name} in the card must hold {size} finite numbers, got {len(vector)}")
@@ -622,7 +619,7 @@ class Tweener(checkpoints.NetworkModel[GeneratorNetwork], Inbetweener):
         """Its name in notes."""
         return SOURCE if self.style is None else f"{SOURCE} in the style of {self.style.name}"
 
-    def styled(self, dna: MotionDna) -> "Tweener":
+    def styled(self, dna: Float[Tensor, "poses joints 3"]) -> "Tweener":
         """Return the in-betweener that moves as a motion of which these are poses."""
         return self.in_style(self.encode_style(dna))
 
@@ -631,9 +628,9 @@ class Tweener(checkpoints.NetworkModel[GeneratorNetwork], Inbetweener):
         return replace(self, style=style)
 
     @torch.no_grad()
-    def encode_style(self, dna: MotionDna, name: str = "motion DNA") -> Style:
+    def encode_style(self, dna: Float[Tensor, "poses joints 3"], name: str = "motion DNA") -> Style:
         """Encode poses of a motion as a style of this name."""
-        return Style(name, self.network.style(dna.poses[None])[0], dna.poses)
+        return Style(name, self.network.style(dna[None])[0], dna)
 
     @torch.no_grad()
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
@@ -738,7 +735,6 @@ def _show(query: GapQuery, given: Mapping[int, Float[Tensor, "joints 3"]]) -> tu
         heading(body.local_quat_xyzw[:, 0]).float()[None],
         see_contacts(planted[None], known.any(dim=1)[None]),
         known=known[None],
-        present=torch.ones(1, len(positions), dtype=torch.bool),
     )
     return (image if query.loose is None else show_loose_keys(image, query.loose)), origin
 

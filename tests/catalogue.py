@@ -121,7 +121,7 @@ def excite(network: LstmGmm, seed: int) -> None:
     with torch.no_grad():
         for values in (network.out.weight, network.out.bias):
             values += 0.3 * torch.randn(values.shape, generator=generator(seed), dtype=values.dtype)
-        if network.correlation is not None:
+        if network.config.correlated:
             values = network.correlation
             values += 0.1 * torch.randn(values.shape, generator=generator(seed), dtype=values.dtype)
 

@@ -98,12 +98,15 @@ def data(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def small_judgements() -> Iterator[None]:
     """Models in training are judged in a moment, on few windows, where a test is not about how well they do."""
+    from priors.training import critics, gaps
     from priors.training.recipes import lstm_gmm, pose_transformer, refiner, stitcher
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lstm_gmm, "measure_free_runs", partial(lstm_gmm.measure_free_runs, runs=2, frames=20))
-        patch.setattr(pose_transformer, "_VALIDATED_WINDOWS", 4)
-        small = {"_WARM_UP": 1, "_HEAD_START": 1, "_CRITIC_WIDTH": 6, "_SAMPLES": 6, "_JUDGED": 2, "_SECONDS": 1.2}
+        patch.setattr(gaps, "_WINDOWS", 2)
+        patch.setattr(pose_transformer, "_CALIBRATED_WINDOWS", 4)
+        small = {"_WARM_UP": 1, "_HEAD_START": 1, "_SAMPLES": 6, "_JUDGED": 2, "_SECONDS": 1.2}
+        patch.setattr(critics, "_END_WIDTH", 6)
         for name, value in small.items():
             patch.setattr(refiner, name, value)
         patch.setattr(stitcher, "_WINDOWS", 4)

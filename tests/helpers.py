@@ -23,8 +23,8 @@ from mapctl.terms.trial import Trial
 from priors.checkpoints import Card
 from priors.lstm_gmm.density import LstmGmmDensity
 from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig
-from priors.training.data import Corpus
-from priors.training.recipes.lstm_gmm import compute_feature_statistics, measure_data_limits, select_initial_states
+from priors.training.data import Corpus, compute_feature_statistics
+from priors.training.recipes.lstm_gmm import measure_data_limits, select_initial_states
 
 STRIDE = 0.25
 """Swing of the upper legs, radians."""

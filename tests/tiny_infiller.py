@@ -36,7 +36,7 @@ def save_tiny_infiller(path: Path, *, drawn: float = 0.0, config: InfillerConfig
     return save_model(tiny_infiller(drawn=drawn, config=config), path)
 
 
-def shown(motion, known=None, *, present=None, contacts=None):
+def shown(motion, known=None, *, contacts=None):
     """The image of a canonical motion, of which all is known unless said otherwise."""
     positions, frames = motion.joint_positions()[None], motion.num_frames
     whole = torch.ones(1, frames, CANONICAL.num_joints, dtype=torch.bool)
@@ -45,5 +45,4 @@ def shown(motion, known=None, *, present=None, contacts=None):
         kinematics.heading(motion.local_quat_xyzw[:, 0])[None],
         torch.ones(1, frames, 2).double() if contacts is None else contacts,
         known=whole if known is None else known,
-        present=whole[..., 0] if present is None else present,
     )

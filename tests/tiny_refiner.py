@@ -6,7 +6,7 @@ import torch
 from helpers import corpus
 from tiny_files import make_card
 
-from priors.refiner import LstmRefiner, RefinerConfig, RefinerNetwork, count_channels
+from priors.refiner import LstmRefiner, RefinerConfig, RefinerNetwork
 
 TINY = RefinerConfig(width=6, memory=5, lookahead=2, joints=("hips", "leftHand", "rightToes"))
 walks = cache(corpus)
@@ -15,7 +15,7 @@ walks = cache(corpus)
 def network_of(config=TINY, *, trained=True, scale=1.0):
     """In float64, with the statistics of the walks; `trained` draws the last layer, which is zero at first."""
     features = walks().features
-    reach = torch.linspace(-0.5, 0.5, count_channels(config.joints))
+    reach = torch.linspace(-0.5, 0.5, 6 * len(config.joints))
     with torch.random.fork_rng():
         torch.manual_seed(3)
         network = RefinerNetwork(

@@ -8,7 +8,6 @@ import torch
 from tiny_files import make_card
 from torch import Tensor
 
-from mapctl.motion_dna import MotionDna
 from mapctl.protocols import PathPredictor
 from priors import checkpoints
 from priors.checkpoints import compute_hash
@@ -30,7 +29,7 @@ def card(
     path: str = "", classes: Sequence[str] = (), held_out: Mapping[str, Sequence[str]] | None = None
 ) -> checkpoints.Card:
     """Card of the tiny tweener, trained with the path predictor of this hash, with invented classes."""
-    members = {name: [MotionDna(_draw_poses(name))] for name in classes}
+    members = {name: [_draw_poses(name)] for name in classes}
     encoded = encode_classes(network().style, members) if classes else {}
     return make_card("tweener", CONFIG, path=path, held_out=held_out or {}, **encoded)
 

@@ -34,16 +34,16 @@ class ToyDensity(Density[LastFrameState]):
     def _score(self, noise):
         return -(0.5 * noise.square() + self.sigma.log() + 0.5 * math.log(2 * math.pi)).sum(-1) - 2 * math.log(2)
 
-    def _noise(self, features, state, seen):
-        expected = self._expect(torch.cat([state.last_frame[:, None], seen[:, :-1]], dim=1))
+    def _noise(self, features, state):
+        expected = self._expect(torch.cat([state.last_frame[:, None], features[:, :-1]], dim=1))
         return (features[..., :N] - expected) / self.sigma
 
-    def log_prob(self, features, state, *, inputs=None):
-        return self._score(self._noise(features, state, features if inputs is None else inputs))
+    def log_prob(self, features, state):
+        return self._score(self._noise(features, state))
 
     def latents(self, features, state):
         bits = features[..., N:] > 0.5
-        return DiscreteChoices(0 * bits[..., 0].long(), bits), self._noise(features, state, features)
+        return DiscreteChoices(0 * bits[..., 0].long(), bits), self._noise(features, state)
 
     def plan(self, state, noise):
         return DiscreteChoices(torch.zeros(noise.shape[:2]).long(), torch.zeros(*noise.shape[:2], 2) > 0)

@@ -25,7 +25,7 @@ _SMALL: dict[str, dict[str, Any]] = {
     },
     "denoiser": {**_WINDOWS, "shape": tiny_denoiser.CONFIG},
     "pose-transformer": {**_WINDOWS, "shape": tiny_transformer.CONFIG},
-    "infiller": {**_WINDOWS, "shape": tiny_infiller.CONFIG},
+    "infiller": {"batch": 200, "window": 32, "shape": tiny_infiller.CONFIG},
     "keyframe-timing": {},
     "path": {**_WINDOWS, "shape": tiny_path.CONFIG},
     "tweener": {**_WINDOWS, "shape": tiny_tweener.CONFIG},

@@ -41,8 +41,8 @@ class Linear(Density[LastFrameState]):
     def advance(self, state, committed):
         return LastFrameState(committed[:, -1])
 
-    def log_prob(self, features, state, *, inputs=None):
-        mean, odds = self.expect(features if inputs is None else inputs, state)
+    def log_prob(self, features, state):
+        mean, odds = self.expect(features, state)
         bits = binary_cross_entropy_with_logits(odds, features[..., N:], reduction="none")
         return Normal(mean, self.sigma).log_prob(features[..., :N]).sum(-1) - bits.sum(-1)
 

@@ -35,8 +35,6 @@ class PositionImage:
     """Left and right toe planted, 0 or 1; 0.5 where the toe is not known."""
     known_axes: Bool[Tensor, "batch frames joints 3"]
     """Which coordinates of a joint's position are known, in the reference's axes; drawings tell two of them."""
-    present: Bool[Tensor, "batch frames"]
-    """Whether there is such a frame; others fill up a batch."""
     ground: Float[Tensor, "batch frames 2"]
     """Position of the reference (x, z), world, metres."""
     heading: Float[Tensor, "batch frames"]
@@ -49,19 +47,17 @@ class PositionImage:
         contacts: Float[Tensor, "batch frames 2"],
         *,
         known: Bool[Tensor, "batch frames joints"],
-        present: Bool[Tensor, "batch frames"],
         known_axes: Bool[Tensor, "batch frames joints 3"] | None = None,
     ) -> "PositionImage":
         """Build an image from world positions (metres) and the hips' heading (radians), interpolated where they are not
         known; the reference is their root. Contacts of toes that are not known may be anything finite. Where single
         coordinates are known they are given by `known_axes`, beside the joints that are `known` whole."""
-        known = known & present[..., None]
         axes = known[..., None].expand(*known.shape, 3)
         if known_axes is not None:
-            axes = axes | (known_axes & present[..., None, None])
+            axes = axes | known_axes
         bits = torch.where(known[..., list(TOE_JOINTS)], contacts, 0.5)
         ground, facing = positions_world[..., 0, ::2], rotations.unwrap_angle(heading)
-        image = PositionImage(positions_world, bits, axes, present, ground, facing)
+        image = PositionImage(positions_world, bits, axes, ground, facing)
         return replace(image, positions=image.from_world(positions_world))
 
     def from_world(
@@ -83,7 +79,6 @@ class PositionImage:
             mirror_positions(self.positions),
             self.contacts.flip(-1),
             self.known_axes[..., _PARTNERS, :],
-            self.present,
             self.ground * flip,
             -self.heading,
         )
@@ -95,10 +90,8 @@ class PositionImage:
         contacts = torch.nn.functional.pad(self.contacts, (0, 0, frames, frames), value=0.5)
         held = torch.arange(-frames, self.positions.shape[1] + frames, device=self.positions.device)
         held = held.clamp(0, self.positions.shape[1] - 1)
-        positions, present, ground, heading = (
-            each[:, held] for each in (self.positions, self.present, self.ground, self.heading)
-        )
-        return PositionImage(positions, contacts, known, present, ground, heading)
+        positions, ground, heading = (each[:, held] for each in (self.positions, self.ground, self.heading))
+        return PositionImage(positions, contacts, known, ground, heading)
 
     @property
     def known(self) -> Bool[Tensor, "batch frames joints"]:
@@ -154,11 +147,7 @@ def propose_from_positions(
     positions, facing = body.joint_positions(), heading(shown.local_quat_xyzw[:, 0])
     planted = contacts.detect_contacts(positions[:, list(TOE_JOINTS)], PRIOR_FPS)
     image = PositionImage.of_world(
-        positions.float()[None],
-        facing.float()[None],
-        planted.float()[None],
-        known=query.known_positions[None],
-        present=torch.ones(1, len(positions), dtype=torch.bool),
+        positions.float()[None], facing.float()[None], planted.float()[None], known=query.known_positions[None]
     )
     answer = complete(image)
     wanted = image.to_world(_remove_jitter(answer.positions, image))[0].double()

@@ -123,10 +123,6 @@ def lead_over_keys(
     return torch.stack([ground[:, 0], path[:, 1], ground[:, 2]], dim=-1)
 
 
-SPANS = (1, 2, 4, 8, 16, 32, 64)
-"""Frames at the prior's rate after which displacements are compared: V1 to V64, the paper's V2 to V128 in time."""
-
-
 def compute_displacement_errors(
     predicted_xz: Float[Tensor, "*batch frames 2"], true_xz: Float[Tensor, "*batch frames 2"], span: int
 ) -> Float[Tensor, "*batch spans"]:
@@ -137,15 +133,3 @@ def compute_displacement_errors(
     """
     apart = predicted_xz - true_xz
     return (apart[..., span:, :] - apart[..., :-span, :]).square().sum(dim=-1).add(1e-8).sqrt()
-
-
-def average_displacement_errors(
-    predicted_xz: Float[Tensor, "frames 2"], true_xz: Float[Tensor, "frames 2"]
-) -> dict[str, float]:
-    """Average them over a clip by the name of the span, `V1` and so on, cm; spans that it is too short for are left
-    out."""
-    return {
-        f"V{span}": 100 * float(compute_displacement_errors(predicted_xz, true_xz, span).mean())
-        for span in SPANS
-        if span < len(true_xz)
-    }

@@ -1,18 +1,15 @@
-"""Measures of the whole body: jitter, worst frames, and liveliness.
+"""Measures of the whole body: jitter and worst frames.
 
 Worst frames (the fastest hand, the largest acceleration, the longest travel without support) are reported beside
-means, which hide them: a hand that jumps by half a metre in one frame of two hundred hardly moves the mean. Liveliness
-(speed, spread and jerk of joints) is a ratio of sums over many gaps, since a mean of ratios is dominated by bodies that
-stand still.
+means, which hide them: a hand that jumps by half a metre in one frame of two hundred hardly moves the mean.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from mapctl import contacts, rotations
@@ -132,29 +129,6 @@ def measure_accelerations(positions: Float[Tensor, "frames joints 3"], fps: floa
     return positions.diff(n=2, dim=0).norm(dim=-1).amax(dim=1) * fps**2
 
 
-@dataclass(frozen=True)
-class Liveliness:
-    """Sums over frames and joints of the body seen from its hips along their heading."""
-
-    count: float
-    """Frames times joints that were summed over."""
-    error: float
-    """Distances from the true positions, cm."""
-    speed: float
-    """Changes from frame to frame, cm."""
-    spread: float
-    """Distances from the mean pose, cm."""
-    jerk: float
-    """Third differences, cm."""
-
-    def __add__(self, other: "Liveliness") -> "Liveliness":
-        return Liveliness(*(getattr(self, one.name) + getattr(other, one.name) for one in fields(self)))
-
-
-NOTHING = Liveliness(0.0, 0.0, 0.0, 0.0, 0.0)
-"""To begin a sum with."""
-
-
 def see_from_hips(
     positions: Float[Tensor, "*batch frames joints 3"], hips_world_matrix: Float[Tensor, "*batch frames 3 3"]
 ) -> Float[Tensor, "*batch frames joints 3"]:
@@ -166,22 +140,3 @@ def measure_path_length(motion: Motion) -> float:
     """Measure the length of the joints' paths as seen from the hips, mean over joints, metres."""
     seen = see_from_hips(motion.joint_positions(), rotations.to_matrix(motion.local_quat_xyzw[:, 0]))
     return float(seen.diff(dim=0).norm(dim=-1).sum(dim=0).mean())
-
-
-def measure_liveliness(
-    seen: Float[Tensor, "frames joints 3"], true: Float[Tensor, "frames joints 3"], inside: Bool[Tensor, " frames"]
-) -> Liveliness:
-    """Measure one motion as `see_from_hips` returns it beside the true one, in the frames inside the gap; differences
-    take in the keys around it."""
-    joints = seen.shape[1]
-    error = ((seen - true).norm(dim=-1) * inside[:, None]).sum()
-    within = seen[inside]
-    spread = (within - within.mean(dim=0)).norm(dim=-1).sum()
-    sums = []
-    for order in (1, 3):
-        change = torch.diff(seen, n=order, dim=0).norm(dim=-1)
-        near = inside.float().unfold(0, order + 1, 1).amax(dim=-1)
-        sums.append((change * near[:, None]).sum())
-    speed, jerk = sums
-    found = (_UNIT * float(each) for each in (error, speed, spread, jerk))
-    return Liveliness(float(inside.sum()) * joints, *found)

@@ -156,10 +156,6 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
         """Load the kernels of the fast path, if it is taken."""
         _ = self._rollout_engine
 
-    def without_kernels(self) -> "LstmGmmDensity":
-        """Return the density on the torch reference, to compare the fast path with."""
-        return replace(self, use_fast=False)
-
     @property
     def feature_mean(self) -> Float[Tensor, " size"]:
         """Mean of the training data, physical units."""
@@ -194,12 +190,8 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
         return replace(self._with_network(self.reference.conditioned_on(full)), initial_states=picked)
 
     def conditioned_like_start(self, start: int) -> "LstmGmmDensity":
-        return self.conditioned_like_clip(self.initial_states.names[start])
-
-    def conditioned_like_clip(self, name: str) -> "LstmGmmDensity":
-        """Return the density conditioned on the labels in a clip's path, of those that it has."""
         pattern = self.card.data.get("labels", "")
-        given = _parse_match(re.search(pattern, name)) if pattern else set()
+        given = _parse_match(re.search(pattern, self.initial_states.names[start])) if pattern else set()
         known = sorted(given & {*self.reference.config.labels})
         return self._with_network(self.reference.conditioned_on(known))
 
@@ -265,14 +257,8 @@ class LstmGmmDensity(checkpoints.LoadedModel, Density[LstmState]):
         found = minimise(differentiate(energy), start, settings=_SEARCH, meter=Meter(_BUDGET))
         return state_of(found.x)
 
-    def log_prob(
-        self,
-        features: Float[Tensor, "batch frames size"],
-        state: LstmState,
-        *,
-        inputs: Float[Tensor, "batch frames size"] | None = None,
-    ) -> Float[Tensor, "batch frames"]:
-        return self.reference.log_prob(features, state, inputs=inputs)
+    def log_prob(self, features: Float[Tensor, "batch frames size"], state: LstmState) -> Float[Tensor, "batch frames"]:
+        return self.reference.log_prob(features, state)
 
     def advance(self, state: LstmState, committed: Float[Tensor, "batch frames size"]) -> LstmState:
         return self.reference.advance(state, committed)

@@ -32,7 +32,7 @@ from torch.autograd.function import once_differentiable
 from mapctl.features import LAYOUT
 from mapctl.numerics.jit import make_jit_decorators
 from mapctl.protocols import DiscreteChoices, PreparedRollout
-from priors.lstm_gmm.network import LstmGmm, LstmState
+from priors.lstm_gmm.network import CLAMP, MAX_LOG_SIGMA, MIN_LOG_SIGMA, LstmGmm, LstmState
 
 
 def _type_widening(typing_context: Any, value: Any) -> Any:
@@ -104,18 +104,12 @@ class MixtureConstants(NamedTuple):
     """First of the two contact rows."""
     retain: np.float32
     """Share of the current frame carried into the means."""
-    clamp: np.float32
-    """Clamp of the carried frame, standard deviations."""
-    low: np.float32
-    """Least log sigma."""
-    high: np.float32
-    """Greatest log sigma."""
     mean: Array
     """(Z,) of the features, physical units."""
     std: Array
     """(Z,), physical units; 1 where padded."""
     cholesky: Array
-    """(components, C, C): what correlates each component's Gaussian values; ones on the diagonal where nothing does."""
+    """(components, C, C): what correlates each component's Gaussian values."""
 
 
 class Tape(NamedTuple):
@@ -166,19 +160,15 @@ def pack_constants(model: LstmGmm) -> MixtureConstants:
     rows, features = round_up_to(size, ROW_STEP), round_up_to(LAYOUT.size, WIDTH_STEP)
     std = np.ones(features, np.float32)
     std[: LAYOUT.size] = _to_numpy(model.std)
-    alone = torch.eye(size).repeat(config.components, 1, 1)
     return MixtureConstants(
         continuous=size,
         log_sigma=rows,
         weight=2 * rows,
         contact=2 * rows + config.components,
         retain=np.float32(config.retain),
-        clamp=np.float32(config.clamp),
-        low=np.float32(config.min_log_sigma),
-        high=np.float32(config.max_log_sigma),
         mean=_pad(_to_numpy(model.mean), features),
         std=std,
-        cholesky=np.ascontiguousarray(_to_numpy(alone if model.cholesky is None else model.cholesky)),
+        cholesky=np.ascontiguousarray(_to_numpy(model.cholesky)),
     )
 
 
@@ -258,6 +248,7 @@ def _pack_head(model: LstmGmm, values: Tensor, *columns: int) -> Array:
 
 
 _ZERO, _HALF, _ONE, _TWO, _FOUR = (np.float32(value) for value in (0, 0.5, 1, 2, 4))
+_CLAMP, _LOW, _HIGH = (np.float32(value) for value in (CLAMP, MIN_LOG_SIGMA, MAX_LOG_SIGMA))
 _LOG2E, _LN2_HIGH, _LN2_LOW = np.float32(1.44269504), np.float32(0.693359375), np.float32(-2.12194440e-4)
 _EXP_LOW, _EXP_HIGH = np.float32(-87.0), np.float32(88.0)
 _EXP = tuple(np.float32(1 / math.factorial(k)) for k in range(8))
@@ -479,14 +470,14 @@ def compose_gaussian(settings, head, before, noise, after, cholesky):
     """
     size = settings.continuous
     means, rows = head[:size], head[settings.log_sigma : settings.log_sigma + size]
-    span, limit, density = settings.high - settings.low, settings.clamp, _ZERO
+    span, limit, density = _HIGH - _LOW, _CLAMP, _ZERO
     for j in range(size):
         carried = before[j]
         carried = -limit if carried < -limit else (limit if carried > limit else carried)
         after[j] = means[j] + settings.retain * carried
     for j in range(size):
         share = sigmoid(_FOUR * rows[j] / span - _ONE)
-        log_sigma = settings.low + span * share
+        log_sigma = _LOW + span * share
         means[j] = exp(log_sigma)
         rows[j] = _FOUR * share * (_ONE - share)
         density -= log_sigma + _HALF * noise[j] * noise[j]
@@ -578,7 +569,7 @@ def compose_pullback(settings, tape, noise, component, t, d_feature, d_density, 
         for j in range(size, len(gradient)):
             gradient[j] = _ZERO
         for j in range(size):
-            inside = before[j] >= -settings.clamp and before[j] <= settings.clamp
+            inside = before[j] >= -_CLAMP and before[j] <= _CLAMP
             gradient[j] = settings.retain * d_rows[j] if inside else _ZERO
 
 
@@ -648,8 +639,7 @@ class FastRollout:
 
     def plan(self, state: LstmState, noise: Float[Tensor, "batch frames continuous"]) -> DiscreteChoices:
         """The likeliest component and contact bits of each frame along the rollout that the noise gives."""
-        batch, frames, _ = noise.shape
-        return FastWindow(self, state, _allocate_choices(batch, frames), batch, keeps=False).plan(noise)
+        return self.plan_window(state, noise, keeps=False)[0]
 
     def rollout(
         self, state: LstmState, noise: Float[Tensor, "batch frames continuous"], plan: DiscreteChoices
@@ -659,8 +649,7 @@ class FastRollout:
         Differentiable, once, with respect to the noise. ValueError if the plan does not fit noise and network
         (compiled code would read past its arrays).
         """
-        window = self.prepare(state, plan, keeps=noise.requires_grad)
-        return _Rollout.apply(noise, window)
+        return _Rollout.apply(noise, self.prepare(state, plan, keeps=noise.requires_grad))
 
     def sample(
         self, state: LstmState, frames: int, generator: torch.Generator, *, temperature: float = 1.0
@@ -686,11 +675,11 @@ class FastRollout:
         return FastWindow(self, state, choices, batch, keeps=keeps)
 
     def plan_window(
-        self, state: LstmState, noise: Float[Tensor, "batch frames continuous"]
+        self, state: LstmState, noise: Float[Tensor, "batch frames continuous"], *, keeps: bool = True
     ) -> tuple[DiscreteChoices, "FastWindow"]:
-        """`plan`, and rollouts prepared under it, of which that of this noise is done already."""
+        """`plan`, and rollouts prepared under it, of which that of this noise is done already; `keeps` as `prepare`."""
         batch, frames, _ = noise.shape
-        window = FastWindow(self, state, _allocate_choices(batch, frames), batch)
+        window = FastWindow(self, state, _allocate_choices(batch, frames), batch, keeps=keeps)
         return window.plan(noise), window
 
 

@@ -20,6 +20,7 @@ import copy
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -30,7 +31,7 @@ from mapctl.features import LAYOUT, PRIOR_FPS
 from mapctl.pose import BodyPose
 from mapctl.protocols import DensityState, DiscreteChoices
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
-from priors.checkpoints import NetworkConfig, require_at_least
+from priors.checkpoints import NetworkConfig, Size
 
 _CHANGE = 2e-3  # of a feature, by which steps are differentiated
 _JOINTS = LAYOUT.slices["joint_rotations"].start
@@ -79,33 +80,30 @@ def condition_on_standing(
 
 NOISE_UNIT = 0.1
 """Level of input noise (normalised units) that is 1 in the network's condition."""
+CLAMP = 5.0
+"""Standard deviations to which the carried frame is clamped, which bounds free runs."""
+MIN_LOG_SIGMA, MAX_LOG_SIGMA = -4.6, 1.0
+"""Floor and ceiling of the predicted log standard deviations (normalised units)."""
 
 
 @dataclass(frozen=True)
 class LstmGmmConfig(NetworkConfig):
     """Shape of the network."""
 
-    width: int = 500
+    FIXED: ClassVar = {"clamp": CLAMP, "min_log_sigma": MIN_LOG_SIGMA, "max_log_sigma": MAX_LOG_SIGMA}
+
+    width: Size = 500
     """Units of every hidden layer."""
-    components: int = 5
+    components: Size = 5
     """Gaussians in the mixture."""
     retain: float = 0.9
     """Share of the current (normalised) frame carried into the means; 0 is the paper's absolute prediction."""
-    clamp: float = 5.0
-    """The carried frame is clamped to this many standard deviations, which bounds free runs."""
-    min_log_sigma: float = -4.6
-    """Floor of the predicted log standard deviations (normalised units)."""
-    max_log_sigma: float = 1.0
-    """Ceiling of the predicted log standard deviations (normalised units)."""
     correlated: bool = True
     """Whether each component has a triangular factor that correlates its values; the paper's Gaussians are diagonal."""
     knows_noise: bool = True
     """Whether the level of the noise on the input is an input of the network."""
     labels: tuple[str, ...] = ()
     """Labels on which it can be conditioned, each yes or no: `gait=run`, `style=active`."""
-
-    def __post_init__(self):
-        require_at_least(self, 1, "width", "components")
 
 
 PAPER = LstmGmmConfig(width=500, components=5, retain=0.0, correlated=False, knows_noise=False)
@@ -139,7 +137,7 @@ class Mixture:
     def log_prob(
         self,
         target: Float[Tensor, "*batch size"],
-        inverse_cholesky: Float[Tensor, "components continuous continuous"] | None,
+        inverse_cholesky: Float[Tensor, "components continuous continuous"],
         blur: Float[Tensor, "components continuous"] | None = None,
     ) -> Float[Tensor, "*batch"]:
         """Eq. 8 without its sign, plus the contact bits; the target is normalised, its bits are 0 or 1.
@@ -148,9 +146,7 @@ class Mixture:
         `blur` is added to the variances of the decorrelated values.
         """
         continuous, bits = target[..., : self.mean.shape[-1]], target[..., self.mean.shape[-1] :]
-        error = continuous.unsqueeze(-2) - self.mean
-        if inverse_cholesky is not None:
-            error = torch.einsum("kij,...kj->...ki", inverse_cholesky, error)
+        error = torch.einsum("kij,...kj->...ki", inverse_cholesky, continuous.unsqueeze(-2) - self.mean)
         log_sigma = self.log_sigma if blur is None else 0.5 * torch.log(torch.exp(2 * self.log_sigma) + blur)
         error = error * torch.exp(-log_sigma)
         each = -0.5 * (error**2).sum(-1) - log_sigma.sum(-1) - 0.5 * math.log(2 * math.pi) * error.shape[-1]
@@ -184,22 +180,19 @@ class LstmGmm(nn.Module):
         conditions = int(config.knows_noise) + len(config.labels)
         self.condition = nn.Linear(conditions, width, bias=False) if conditions else None
         square = (config.components, LAYOUT.continuous, LAYOUT.continuous)
-        self.correlation = nn.Parameter(torch.zeros(square)) if config.correlated else None
+        self.correlation = nn.Parameter(torch.zeros(square), requires_grad=config.correlated)
 
     @property
-    def inverse_cholesky(self) -> Float[Tensor, "components continuous continuous"] | None:
+    def inverse_cholesky(self) -> Float[Tensor, "components continuous continuous"]:
         """Unit lower triangular factor of each component: it takes the values' correlation away."""
-        if self.correlation is None:
-            return None
         return torch.tril(self.correlation, -1) + torch.eye(LAYOUT.continuous).to(self.correlation)
 
     @property
-    def cholesky(self) -> Float[Tensor, "components continuous continuous"] | None:
+    def cholesky(self) -> Float[Tensor, "components continuous continuous"]:
         """Inverse of `inverse_cholesky`: it makes independent values correlated."""
-        if (inverse_cholesky := self.inverse_cholesky) is None:
-            return None
-        unit = torch.eye(LAYOUT.continuous).to(inverse_cholesky).expand_as(inverse_cholesky)
-        return torch.linalg.solve_triangular(inverse_cholesky, unit, upper=False, unitriangular=True)
+        inverse = self.inverse_cholesky
+        unit = torch.eye(LAYOUT.continuous).to(inverse).expand_as(inverse)
+        return torch.linalg.solve_triangular(inverse, unit, upper=False, unitriangular=True)
 
     def conditioned_on(self, labels: Iterable[str]) -> "LstmGmm":
         """Return a copy conditioned on these labels, whose weights are this network's; its inputs are taken to be
@@ -238,9 +231,7 @@ class LstmGmm(nn.Module):
         """
         model, size = self._copy_with_same_weights(), LAYOUT.continuous
         variance = (sigma.to(self.std) / self.std[:size]).square().expand(self.config.components, size)
-        if (inverse_cholesky := self.inverse_cholesky) is not None:
-            variance = torch.einsum("kij,kj->ki", inverse_cholesky.detach().square(), variance)
-        model.blur = variance.clone()
+        model.blur = torch.einsum("kij,kj->ki", self.inverse_cholesky.detach().square(), variance)
         return model
 
     def normalise(self, features: Float[Tensor, "*batch size"]) -> Float[Tensor, "*batch size"]:
@@ -276,24 +267,15 @@ class LstmGmm(nn.Module):
         count = config.components
         weight, mean, log_sigma, contact = output.split([count, count * size, count * size, 2], dim=-1)
         mean, log_sigma = mean.unflatten(-1, (count, size)), log_sigma.unflatten(-1, (count, size))
-        carried = config.retain * inputs[..., :size].clamp(-config.clamp, config.clamp)
+        carried = config.retain * inputs[..., :size].clamp(-CLAMP, CLAMP)
         # A smooth floor and ceiling keep gradients alive where a hard clamp would stop them.
-        low, high = config.min_log_sigma, config.max_log_sigma
+        low, high = MIN_LOG_SIGMA, MAX_LOG_SIGMA
         log_sigma = low + (high - low) * torch.sigmoid(4 * log_sigma / (high - low) - 1.0)
         return Mixture(torch.log_softmax(weight, dim=-1), mean + carried.unsqueeze(-2), log_sigma, contact)
 
-    def log_prob(
-        self,
-        features: Float[Tensor, "batch frames size"],
-        state: LstmState,
-        *,
-        inputs: Float[Tensor, "batch frames size"] | None = None,
-    ) -> Float[Tensor, "batch frames"]:
-        """Compute the log density (nats, normalised units) of each frame given those before it (Eq. 5-8).
-
-        `inputs` are the frames as the network takes them in, where they differ: the noisy inputs of Eq. 15.
-        """
-        mixture, _ = self._predict(state, features if inputs is None else inputs)
+    def log_prob(self, features: Float[Tensor, "batch frames size"], state: LstmState) -> Float[Tensor, "batch frames"]:
+        """Compute the log density (nats, normalised units) of each frame given those before it (Eq. 5-8)."""
+        mixture, _ = self._predict(state, features)
         return mixture.log_prob(self._target(features), self.inverse_cholesky, self.blur)
 
     def advance(
@@ -321,34 +303,23 @@ class LstmGmm(nn.Module):
         """Draw frames one after the other (section 4.1.4); temperature scales the Gaussians' sigmas, with `sigma_speed`
         each frame is drawn given that toes stand where its bits are 1 (see `condition_on_standing`), and `condition` is
         as in `forward`. Without gradient, unless `differentiable` in the weights for the drawn components and bits."""
+        drawn, device, there, size = [], self.mean.device, generator.device, LAYOUT.continuous
         with torch.set_grad_enabled(differentiable and torch.is_grad_enabled()):
-            return self._draw(state, frames, generator, temperature, sigma_speed, condition)
-
-    def _draw(
-        self,
-        state: LstmState,
-        frames: int,
-        generator: torch.Generator,
-        temperature: float,
-        sigma_speed: float | None,
-        condition: Tensor | None,
-    ) -> tuple[Tensor, LstmState]:
-        drawn, device, cholesky = [], self.mean.device, self.cholesky
-        there, size = generator.device, LAYOUT.continuous
-        for _ in range(frames):
-            mixture, state = self._step(state, condition)
-            weights = mixture.log_weight.detach().exp().to(there)
-            component = torch.multinomial(weights, 1, generator=generator)[:, 0].to(device)
-            noise = temperature * torch.randn(len(weights), size, generator=generator, device=there).to(device)
-            planted = torch.sigmoid(mixture.contact_logit.detach())  # probability
-            bits = torch.rand(planted.shape, generator=generator, device=there).to(device) < planted
-            frame, _ = self._compose(mixture, component, noise, bits, cholesky)
-            if sigma_speed is not None:
-                gaussian = self._find_gaussian(mixture, component, cholesky, temperature)
-                frame = condition_on_standing(sigma_speed, state.last_frame, frame, *gaussian, generator)
-            state = LstmState(frame, state.hidden, state.cell)
-            drawn.append(frame)
-        return torch.stack(drawn, dim=1), state
+            cholesky = self.cholesky
+            for _ in range(frames):
+                mixture, state = self._step(state, condition)
+                weights = mixture.log_weight.detach().exp().to(there)
+                component = torch.multinomial(weights, 1, generator=generator)[:, 0].to(device)
+                noise = temperature * torch.randn(len(weights), size, generator=generator, device=there).to(device)
+                planted = torch.sigmoid(mixture.contact_logit.detach())  # probability
+                bits = torch.rand(planted.shape, generator=generator, device=there).to(device) < planted
+                frame, _ = self._compose(mixture, component, noise, bits, cholesky)
+                if sigma_speed is not None:
+                    gaussian = self._find_gaussian(mixture, component, cholesky, temperature)
+                    frame = condition_on_standing(sigma_speed, state.last_frame, frame, *gaussian, generator)
+                state = LstmState(frame, state.hidden, state.cell)
+                drawn.append(frame)
+            return torch.stack(drawn, dim=1), state
 
     def plan(self, state: LstmState, noise: Float[Tensor, "batch frames continuous"]) -> DiscreteChoices:
         """The likeliest component and contact bits of each frame along the rollout that the noise gives."""
@@ -388,8 +359,7 @@ class LstmGmm(nn.Module):
         with torch.no_grad():
             mixture, _ = self._predict(state, features)
             error = self._target(features)[..., : LAYOUT.continuous].unsqueeze(-2) - mixture.mean
-            if (inverse_cholesky := self.inverse_cholesky) is not None:
-                error = torch.einsum("kij,...kj->...ki", inverse_cholesky, error)
+            error = torch.einsum("kij,...kj->...ki", self.inverse_cholesky, error)
             noise = error * torch.exp(-mixture.log_sigma)
             each = mixture.log_weight - mixture.log_sigma.sum(-1) - 0.5 * noise.square().sum(-1)
             component = each.argmax(-1)
@@ -416,15 +386,13 @@ class LstmGmm(nn.Module):
         component: Int[Tensor, " batch"],
         noise: Float[Tensor, "batch continuous"],
         contacts: Bool[Tensor, "batch 2"],
-        cholesky: Tensor | None,
+        cholesky: Float[Tensor, "components continuous continuous"],
     ) -> tuple[Float[Tensor, "batch size"], Float[Tensor, " batch"]]:
         """One frame (physical units) of the chosen component and bits, and its log density."""
         row = torch.arange(len(component))
         mean, log_sigma = mixture.mean[row, component], mixture.log_sigma[row, component]
         size = LAYOUT.continuous
-        spread = torch.exp(log_sigma) * noise
-        if cholesky is not None:
-            spread = torch.einsum("bij,bj->bi", cholesky[component], spread)
+        spread = torch.einsum("bij,bj->bi", cholesky[component], torch.exp(log_sigma) * noise)
         continuous = (mean + spread) * self.std[:size] + self.mean[:size]
         density = mixture.log_weight[row, component] - log_sigma.sum(-1) - 0.5 * (noise**2).sum(-1)
         density = density - 0.5 * math.log(2 * math.pi) * size
@@ -433,12 +401,12 @@ class LstmGmm(nn.Module):
         return torch.cat([continuous, contacts.to(continuous.dtype)], dim=-1), density
 
     def _find_gaussian(
-        self, mixture: Mixture, component: Int[Tensor, " batch"], cholesky: Tensor | None, temperature: float
+        self, mixture: Mixture, component: Int[Tensor, " batch"], cholesky: Tensor, temperature: float
     ) -> tuple[Float[Tensor, "batch continuous"], Float[Tensor, "batch continuous continuous"]]:
         """Mean of the chosen components and a factor of their covariance, physical units."""
         row, size = torch.arange(len(component)), LAYOUT.continuous
         sigma = temperature * torch.exp(mixture.log_sigma[row, component])
-        factor = torch.diag_embed(sigma) if cholesky is None else cholesky[component] * sigma[:, None]
+        factor = cholesky[component] * sigma[:, None]
         mean = mixture.mean[row, component] * self.std[:size] + self.mean[:size]
         return mean, self.std[:size, None] * factor
 

@@ -286,7 +286,7 @@ def add_copies(corpus: Corpus, count: int, generator: torch.Generator) -> Corpus
     """Return a corpus with so many copies of each clip after it, under the same names, at other tempos and strides."""
     if count == 0:
         return corpus
-    windows = PoseWindows(corpus, evenness=0.0)
+    windows = PoseWindows(corpus)
     names, clips = list(corpus.names), corpus.clips()
     for _ in range(count):
         for number, name in enumerate(corpus.names):

@@ -24,7 +24,7 @@ from mapctl.joint_roles import find_feet
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT
 from mapctl.terms.trial import Trial
 from priors.lstm_gmm.network import LstmGmm
-from priors.refiner import compute_end_effectors, count_channels
+from priors.refiner import compute_end_effectors
 from priors.training.loop import draw_weights, make_divergence_error
 from priors.training.windows import FeatureWindows
 
@@ -62,14 +62,6 @@ class HistoryBuffer:
 
     def __init__(self, windows: Float[Tensor, "size frames features"]):
         self.windows = windows.clone()
-
-    def mix(self, fresh: Float[Tensor, "batch frames features"], generator: torch.Generator) -> Tensor:
-        """Return half a batch of the fresh ones and half of kept ones; the fresh half then replaces kept ones."""
-        half = len(fresh) // 2
-        picked = torch.randperm(len(self.windows), generator=generator)
-        mixed = torch.cat([fresh[: len(fresh) - half], self.windows[picked[:half]]])
-        self.windows[picked[half : 2 * half]] = fresh[:half]
-        return mixed
 
     def keep(self, fresh: Float[Tensor, "batch frames features"], generator: torch.Generator) -> None:
         """Put the fresh ones in place of kept ones."""
@@ -288,6 +280,9 @@ def show(features: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch f
     return torch.cat([about.flatten(2), velocity.flatten(2), hips], dim=-1)
 
 
+_END_WIDTH = 128  # units of the first layer and in each direction of the LSTM (the paper's 500)
+_AROUND = 2  # frames on either side that its first layer sees (the paper's 0): jitter takes three frames
+_SLOW = 0.05  # ground speed of feet, m/s, below which the critic sees it magnified
 _FOOT_JOINTS = ("leftFoot", "leftToes", "rightFoot", "rightToes")
 
 
@@ -297,33 +292,25 @@ class EndEffectorCritic(nn.Module):
     reach_mean: Tensor
     reach_std: Tensor
 
-    def __init__(
-        self, joints: Sequence[str], *, width: int, around: int, slow: float, reach_mean: Tensor, reach_std: Tensor
-    ):
-        """`width` units in the first layer and in each direction of the LSTM; the first layer sees `around` frames on
-        either side of its own, and feet's ground speeds under `slow` (m/s) magnified, unless that is 0.
-        """
+    def __init__(self, joints: Sequence[str], *, reach_mean: Tensor, reach_std: Tensor):
+        """Take the mean and the spread of `compute_end_effectors`."""
         super().__init__()
         self.joints = tuple(joints)
         self.register_buffer("reach_mean", reach_mean.clone())
         self.register_buffer("reach_std", reach_std.clone())
-        self.slow = slow
-        self.magnified_columns = [
-            len(joints) + number for number, name in enumerate(joints) if slow > 0 and name in _FOOT_JOINTS
-        ]
-        seen = count_channels(joints) + 2 * len(self.magnified_columns) + 2
-        self.first = nn.Conv1d(seen, width, 2 * around + 1)
+        self.magnified_columns = [len(joints) + number for number, name in enumerate(joints) if name in _FOOT_JOINTS]
+        seen, width = len(reach_mean) + 2 * len(self.magnified_columns) + 2, _END_WIDTH
+        self.first = nn.Conv1d(seen, width, 2 * _AROUND + 1)
         self.lstm = nn.LSTM(width, width, batch_first=True, bidirectional=True)
         self.last = nn.Linear(2 * width, 1)
 
     def forward(self, features: Float[Tensor, "batch frames size"]) -> Float[Tensor, "batch judged"]:
         """Logits, frame by frame, that a window was captured; for the frames that have enough on either side."""
         ends = compute_end_effectors(features, self.joints)
-        seen = [(ends - self.reach_mean) / self.reach_std, 2 * LAYOUT.pick(features, "contacts")[:, 1:] - 1]
-        if self.magnified_columns:
-            # A foot that slides by 10 cm/s is a twentieth of the spread of feet's speeds, and what every viewer sees.
-            ground = ends.unflatten(-1, (-1, 3))[:, :, self.magnified_columns, ::2]
-            seen.append(0.5 * torch.asinh(ground / self.slow).flatten(2))
-        seen = torch.cat(seen, dim=-1).transpose(1, 2)
+        # A foot that slides by 10 cm/s is a twentieth of the spread of feet's speeds, and what every viewer sees.
+        ground = ends.unflatten(-1, (-1, 3))[:, :, self.magnified_columns, ::2]
+        magnified = 0.5 * torch.asinh(ground / _SLOW).flatten(2)
+        bits = 2 * LAYOUT.pick(features, "contacts")[:, 1:] - 1
+        seen = torch.cat([(ends - self.reach_mean) / self.reach_std, bits, magnified], dim=-1).transpose(1, 2)
         hidden, _ = self.lstm(leaky_relu(self.first(seen), 0.2).transpose(1, 2))
         return self.last(hidden)[..., 0]

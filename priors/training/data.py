@@ -22,7 +22,7 @@ from torch import Tensor
 from mapctl import retarget, rotations
 from mapctl.contacts import ContactSettings, estimate_floor_heights
 from mapctl.errors import FileFormatError, MapctlError, RequestError
-from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, integrate_root, mirror_features
 from mapctl.formats import load
 from mapctl.formats.text import read_table
 from mapctl.metrics.gait import CHANGES, PACES, count_pace_changes, follow_pace, measure_speed
@@ -459,6 +459,21 @@ def number_clip_folders(corpus: Corpus) -> Int[Tensor, " clips"]:
     folders = [name.split("/")[0] for name in corpus.names]
     number = {folder: index for index, folder in enumerate(sorted(set(folders)))}
     return torch.tensor([number[folder] for folder in folders])
+
+
+def compute_feature_statistics(features: Float[Tensor, "frames size"]) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation of features and their mirror image; floors keep held joints from exploding.
+
+    Rotations are held to at least 0.01 rad (0.6 degrees), displacements to 1 mm; contact bits map to -1 and 1.
+    """
+    both = torch.cat([features, mirror_features(features)])
+    mean, std = both.mean(0), both.std(0)
+    floor = torch.full_like(std, 0.01)
+    floor[LAYOUT.slices["root_displacement_heading"]] = 0.001
+    floor[LAYOUT.slices["heading_change"]] = 0.002
+    for values in (mean, floor, std):
+        values[LAYOUT.slices["contacts"]] = 0.5
+    return mean, torch.maximum(std, floor)
 
 
 def _follow_speeds(corpus: Corpus) -> list[NDArray[np.floating]]:

@@ -15,7 +15,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from datetime import timedelta
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
@@ -42,6 +42,8 @@ _FIRST_LINE_SECONDS, _LINE_SECONDS = 5.0, 30.0  # to the first line on the losse
 _WARM_UP_SHARE = 0.05  # share of the steps in which the learning rate rises
 _MAX_GRADIENT_NORM = 1.0
 _MOST_NAMED = 5  # files that a warning names
+VALIDATED_BATCHES = 6
+"""Batches whose mean losses are those of unseen clips."""
 _MAY_CHANGE = (
     *("data", "out", "cuts", "level", "licence", "resume", "quiet", "patience", "steps", "device", "bfloat16", "shape"),
     *("checkpoint_minutes", "report_steps", "validate_steps"),
@@ -226,17 +228,13 @@ class NetworkSettings(Settings):
         if self.init is not None and any(getattr(self, name, None) for name in self.shape_options):
             raise RequestError("with --init the network is that model's; options of its shape do not apply")
 
-    def make_config(self) -> Any:
-        """Return the shape of the network that these settings ask for."""
-        config: Any = self.papers if getattr(self, "paper", False) else self.ours
-        given = {name: getattr(self, name) for name in self.shape_options if name != "paper"}
-        return replace(config, **{name: value for name, value in given.items() if value is not None})
-
     def find_config(self) -> Any:
-        """Return the shape of the network: that of the initial model, where there is one."""
-        asked, card = self.shape or self.make_config(), self.init_card
-        if card is None:
-            return asked
+        """Return the shape of the network: that of the initial model, where there is one, else what is asked for."""
+        asked: Any = self.shape or (self.papers if getattr(self, "paper", False) else self.ours)
+        if (card := self.init_card) is None:
+            given = {name: getattr(self, name) for name in self.shape_options if name != "paper"}
+            given = {name: value for name, value in given.items() if value is not None}
+            return type(asked).of_card(asked.as_card() | given)
         if card.kind != self.kind:
             raise CheckpointError(f"{self.init} holds a {card.kind}, not a {self.kind}")
         return type(asked).of_card(card.config)
@@ -363,6 +361,10 @@ class GradientTrainer(Trainer[Network]):
         """Compute that of the current step."""
         return self.settings.learning_rate * warmup_cosine(self.step, self.steps)
 
+    def score(self, row: Row) -> float:
+        """Return the loss of unseen clips."""
+        return row.get("loss") or math.nan
+
     def limit_gradients(self) -> None:
         """Clip the gradients before the optimiser's step."""
         nn.utils.clip_grad_norm_(self.weights(), _MAX_GRADIENT_NORM)
@@ -466,11 +468,11 @@ def train(settings: Settings) -> Path:
             if last or time.monotonic() >= due:
                 rate = (trainer.step - first) / max(1e-9, time.monotonic() - began)
                 left = timedelta(seconds=round((trainer.steps - trainer.step) / rate))
-                means = ", ".join(f"{name} {value:.3f}" for name, value in _average(losses).items())
+                means = ", ".join(f"{name} {value:.3f}" for name, value in average_rows(losses).items())
                 settings.report(f"step {trainer.step}/{trainer.steps}: {means}, {rate:.3g} steps/s, {left} left")
                 due = time.monotonic() + _LINE_SECONDS
             if last or trainer.step % settings.report_steps == 0:
-                log.write(trainer.step, TRAINING, _average(losses))
+                log.write(trainer.step, TRAINING, average_rows(losses))
                 losses = []
         if stopped is not None:
             settings.report(f"{stopped}: training ends with the best weights so far")
@@ -651,10 +653,10 @@ def _finite(values: Mapping[str, Any]) -> Row:
     return {name: v if isinstance(v, int | float) and math.isfinite(v) else None for name, v in values.items()}
 
 
-def _average(rows: Sequence[Row]) -> Row:
+def average_rows(rows: Sequence[Row]) -> Row:
     """Mean of each loss over the rows that have it."""
     names = dict.fromkeys(name for row in rows for name in row)
-    found = {name: [row[name] for row in rows if name in row] for name in names}
+    found = {name: [float(row[name]) for row in rows if name in row] for name in names}
     return {name: sum(values) / len(values) for name, values in found.items()}
 
 

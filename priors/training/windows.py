@@ -25,6 +25,7 @@ from priors.training.data import Corpus, find_window_starts, number_clip_folders
 
 KINDS = ("walk-turn", "walk", "run|dash", "^cmu")
 """Kinds of clips, as patterns of their names, among which windows are evened; clips of none are another kind."""
+_EVENNESS = 0.85  # among these kinds: 0 draws by their frames, 1 the same number of each
 _CHUNK_FRAMES = 50_000  # frames
 _GOING = 0.25  # m/s that the hips of a walking character reach, on average over the frames around one
 _AROUND = 9  # frames, so that a shift of weight is no walk
@@ -42,49 +43,34 @@ class FeatureBatch:
 class FeatureWindows:
     """Draws windows from a corpus."""
 
-    def __init__(self, corpus: Corpus, frames: int, *, evenness: float | None = None, standing_share: float = 1.0):
-        """`evenness` among the corpus' top folders: 0 draws by their frames, 1 the same number from each; None draws
-        by frames without a look at folders. Of the windows in which the hips stay under 0.25 m/s only
-        `standing_share` is drawn. RequestError where no clip is as long as a window.
+    def __init__(self, corpus: Corpus, frames: int, *, evenness: float = 0.0, standing_share: float = 1.0):
+        """`evenness` among the corpus' top folders: 0 draws by their frames, 1 the same number from each. Windows in
+        which the hips stay under 0.25 m/s are drawn `standing_share` times as often as others. RequestError where no
+        clip is as long as a window.
         """
         self.features, self.frames = corpus.features, frames
         self.starts = find_window_starts(corpus.lengths, frames)
+        folder = number_clip_folders(corpus).repeat_interleave(torch.tensor(corpus.lengths))[self.starts]
+        chance = torch.bincount(folder).double()[folder] ** -evenness
         if standing_share < 1:
-            self.starts = _thin_standing(self.features, self.starts, frames, standing_share)
-        if evenness is not None:
-            folder = number_clip_folders(corpus).repeat_interleave(torch.tensor(corpus.lengths))
-            # Grouped, so that drawing a folder and then a window in it needs no table of all windows' chances.
-            self.groups = [self.starts[folder[self.starts] == number] for number in folder.unique()]
-            self.groups = [group for group in self.groups if len(group)]
-            self.probabilities = torch.tensor([float(len(group)) for group in self.groups]) ** (1 - evenness)
-        self.evened = evenness is not None
+            chance[_find_standing(self.features, frames)[self.starts]] *= standing_share
+        self.chances = chance.cumsum(0)
 
     def draw(self, batch: int, generator: torch.Generator) -> FeatureBatch:
         """So many, half of them mirrored."""
-        if self.evened:
-            drawn = torch.multinomial(self.probabilities, batch, replacement=True, generator=generator).tolist()
-            shares = torch.rand(batch, generator=generator).tolist()
-            groups = [self.groups[number] for number in drawn]
-            first = torch.stack([each[int(share * len(each))] for each, share in zip(groups, shares, strict=True)])
-        else:
-            first = self.starts[torch.randint(len(self.starts), (batch,), generator=generator)]
+        at = self.chances[-1] * torch.rand(batch, generator=generator, dtype=torch.float64)
+        first = self.starts[torch.searchsorted(self.chances[:-1], at, right=True)]
         windows = self.features[first[:, None] + torch.arange(self.frames)]
         mirrored = torch.rand(batch, generator=generator) < 0.5
         windows = torch.where(mirrored[:, None, None], mirror_features(windows), windows)
         return FeatureBatch(windows, first, mirrored)
 
 
-def _thin_standing(
-    features: Float[Tensor, "frames size"], starts: Int[Tensor, " starts"], frames: int, share: float
-) -> Int[Tensor, " left"]:
-    """Leave this share of the windows of standing characters, evenly over the corpus, and all others."""
+def _find_standing(features: Float[Tensor, "frames size"], window: int) -> Bool[Tensor, " windows"]:
+    """Find the windows of so many frames, from each frame on, in which a character stands."""
     around = torch.full((1, 1, _AROUND), 1 / _AROUND)
     padded = torch.nn.functional.pad(ground_speed(features)[None, None], (_AROUND // 2, _AROUND // 2), mode="replicate")
-    speed = torch.nn.functional.conv1d(padded, around)[0, 0]
-    standing = speed.unfold(0, frames, 1).amax(-1)[starts] < _GOING
-    number = standing.cumsum(0)
-    left = (share * number).ceil() > (share * (number - 1)).ceil()
-    return starts[~standing | left]
+    return torch.nn.functional.conv1d(padded, around)[0, 0].unfold(0, window, 1).amax(-1) < _GOING
 
 
 _WIDE = {"UpperArm": 0.6, "LowerArm": 0.5, "UpperLeg": 0.5, "LowerLeg": 0.5}
@@ -176,14 +162,13 @@ and hands: legs keep their length, the unit of all others. Half of the windows v
 
 
 class WindowPicker:
-    """Picks where windows begin in a corpus, clips of every kind alike."""
+    """Picks where windows begin in a corpus, clips of all KINDS about alike."""
 
-    def __init__(self, corpus: Corpus, *, evenness: float):
-        """`evenness` among KINDS of clips: 0 draws by their frames, 1 the same number of each kind."""
+    def __init__(self, corpus: Corpus):
         self.lengths = corpus.locate_clips()[0]
         kind = torch.tensor([find_kind(name) for name in corpus.names])
         share = torch.zeros(len(KINDS) + 1).index_add(0, kind, self.lengths.float())
-        self.weights = share[kind] ** -evenness
+        self.weights = share[kind] ** -_EVENNESS
 
     def pick(
         self, span: Int[Tensor, " batch"], generator: torch.Generator
@@ -199,9 +184,8 @@ class WindowPicker:
 class PoseWindows:
     """Draws windows from a corpus."""
 
-    def __init__(self, corpus: Corpus, *, evenness: float):
-        """`evenness` among KINDS of clips: 0 draws by their frames, 1 the same number of each kind."""
-        self.picker = WindowPicker(corpus, evenness=evenness)
+    def __init__(self, corpus: Corpus):
+        self.picker = WindowPicker(corpus)
         self.lengths, self.starts = corpus.locate_clips()
         self.ground, self.heading = corpus.integrate_roots()
         self.height = LAYOUT.pick(corpus.features, "root_height")
@@ -264,27 +248,10 @@ class PoseWindows:
         return rotations.average(torch.cat([sample, mirror_quats(sample)]).double()).float()
 
 
-class PaddedWindows:
-    """Draws windows from a corpus, half of them mirrored, in which shorter clips lie whole."""
-
-    def __init__(self, corpus: Corpus, *, frames: int, evenness: float):
-        """`evenness` among the corpus' top folders: 0 draws by their frames, 1 the same number from each."""
-        self.frames, self.poses = frames, PoseWindows(corpus, evenness=0.0)
-        folder, lengths = number_clip_folders(corpus), self.poses.lengths
-        share = torch.zeros(int(folder.max()) + 1).index_add(0, folder, lengths.float())
-        self.probabilities = lengths / share[folder] ** evenness
-
-    def draw(self, batch: int, generator: torch.Generator) -> tuple[PartialMotion, Bool[Tensor, "batch frames"]]:
-        """So many windows, clips by chance and moments evenly, and whether a clip has each of their frames."""
-        clip = torch.multinomial(self.probabilities, batch, replacement=True, generator=generator)
-        length = self.poses.lengths[clip]
-        spare = length - self.frames  # a shorter clip begins anywhere in the window
-        lead = (torch.rand(batch, generator=generator) * (spare.abs() + 1)).long() * torch.sign(spare)
-        mirrored = torch.rand(batch, generator=generator) < 0.5
-        frame = lead[:, None] + torch.arange(self.frames)
-        present = (frame >= 0) & (frame < length[:, None])
-        motion = self.poses.gather(clip[:, None].expand_as(frame), frame.clamp_min(0).double())
-        return choose_rows(mirrored, motion.mirrored(), motion), present
+def draw_length(shortest: int, longest: int, generator: torch.Generator) -> int:
+    """Draw the frames of windows, as often of each octave; the shortest where the longest is shorter."""
+    share = float(torch.rand((), generator=generator))
+    return round(shortest * (max(shortest, longest) / shortest) ** share)
 
 
 def find_kind(name: str) -> int:

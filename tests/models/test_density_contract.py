@@ -131,17 +131,6 @@ def test_the_rollout_of_its_latents_is_the_motion(density):
     close(density, density.rollout(state, *reversed(density.latents(frames, state)))[0], frames)
 
 
-@each_density
-def test_noisy_inputs_are_seen_but_not_scored(density):
-    state, frames = warm(density), clip(density)
-    seen = frames.clone()
-    seen[:, 4, :SIZE] += 0.05 * density.feature_std[:SIZE]
-    plain, noisy = density.log_prob(frames, state), density.log_prob(frames, state, inputs=seen)
-    close(density, noisy[:, :5], plain[:, :5])
-    assert float((noisy[:, 5] - plain[:, 5]).abs().min()) > 1e-6
-    close(density, density.log_prob(frames, state, inputs=frames), plain)
-
-
 @pytest.mark.slow
 @each_density
 def test_gradients_are_those_of_finite_differences(density):

@@ -22,8 +22,7 @@ def make(width: int, batch: int, components: int = 5, *, frames: int = FRAMES, k
     with torch.no_grad():
         for weight in model.out.parameters():
             weight *= 3
-        if model.correlation is not None:
-            model.correlation.copy_(0.05 * torch.randn(model.correlation.shape, generator=generator))
+        model.correlation.copy_(0.05 * torch.randn(model.correlation.shape, generator=generator))
     hidden, cell = 0.5 * torch.randn(2, 2, batch, width, generator=generator)
     previous = 2 * torch.randn(batch, size, generator=generator)
     noise = torch.randn(batch, frames, size - 2, generator=generator)

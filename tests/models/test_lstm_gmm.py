@@ -19,8 +19,16 @@ from mapctl.skeleton import TOE_JOINTS
 from priors.checkpoints import Card
 from priors.lstm_gmm import density
 from priors.lstm_gmm.density import LstmGmmDensity
-from priors.lstm_gmm.network import LstmGmm, LstmGmmConfig, LstmState, condition_on_standing
-from priors.training.recipes.lstm_gmm import DensityTrainer, compute_feature_statistics, select_initial_states
+from priors.lstm_gmm.network import (
+    MAX_LOG_SIGMA,
+    MIN_LOG_SIGMA,
+    LstmGmm,
+    LstmGmmConfig,
+    LstmState,
+    condition_on_standing,
+)
+from priors.training.data import compute_feature_statistics
+from priors.training.recipes.lstm_gmm import DensityTrainer, select_initial_states
 
 SIZE = LAYOUT.continuous
 
@@ -57,18 +65,16 @@ def test_the_density_is_a_mixture_of_normals_times_two_bernoullis(kind):
     network, frames = NETWORKS[kind], clip()
     state = warm(network)
     mixture = mixture_of(network, state, frames)
-    cholesky = torch.eye(SIZE).double().expand(network.config.components, -1, -1)
-    if network.inverse_cholesky is not None:
-        cholesky = torch.linalg.inv(network.inverse_cholesky)
-        torch.testing.assert_close(network.cholesky, cholesky)
+    cholesky = torch.linalg.inv(network.inverse_cholesky)
+    torch.testing.assert_close(network.cholesky, cholesky)
     normals = MultivariateNormal(mixture.mean, scale_tril=cholesky * mixture.log_sigma.exp().unsqueeze(-2))
     poses = MixtureSameFamily(Categorical(logits=mixture.log_weight), normals)
     bits = Independent(Bernoulli(logits=mixture.contact_logit), 1)
     expected = poses.log_prob(network.normalise(frames)[..., :SIZE]) + bits.log_prob(frames[..., SIZE:])
     torch.testing.assert_close(network.log_prob(frames, state), expected)
     torch.testing.assert_close(mixture.log_weight.exp().sum(-1), torch.ones(2, 9).double())
-    assert float(mixture.log_sigma.min()) > network.config.min_log_sigma
-    assert float(mixture.log_sigma.max()) < network.config.max_log_sigma
+    assert float(mixture.log_sigma.min()) > MIN_LOG_SIGMA
+    assert float(mixture.log_sigma.max()) < MAX_LOG_SIGMA
 
 
 @each_network
@@ -113,8 +119,7 @@ def test_draws_follow_the_mixture(kind):
     weight = mixture.log_weight[0, 0].exp()[:, None]
     mean = (weight * mixture.mean[0, 0]).sum(0)
     variance = (2 * mixture.log_sigma[0, 0]).exp()
-    if network.cholesky is not None:
-        variance = (network.cholesky**2 @ variance.unsqueeze(-1))[..., 0]
+    variance = (network.cholesky**2 @ variance.unsqueeze(-1))[..., 0]
     second = (weight * (mixture.mean[0, 0] ** 2 + variance)).sum(0)
     error = (second - mean**2).sqrt() / count**0.5
     values = network.normalise(drawn)[:, 0]
@@ -326,7 +331,8 @@ def test_a_density_is_conditioned_on_the_labels_of_a_clips_trajectory():
     state, noise = density.initial_states.state.pick(torch.tensor([0])), torch.zeros(1, 3, 66)
     plan = density.plan(state, noise)
 
-    for name, given in (("set/b_run_old_9.bvh", ["run", "old"]), ("set/b_walk_old_9.bvh", ["old"]), ("other.bvh", [])):
-        like, on = density.conditioned_like_clip(name), density.conditioned_on(given)
+    given = {"a_run_old_1": ["run", "old"], "a_walk_old_2": ["old"], "a_walk_new_3": [], "a_run_new_4": ["run"]}
+    for start, name in enumerate(density.initial_states.names):
+        like, on = density.conditioned_like_start(start), density.conditioned_on(given[name])
         assert torch.allclose(like.rollout(state, noise, plan)[0], on.rollout(state, noise, plan)[0])
         assert like.initial_states.names == density.initial_states.names

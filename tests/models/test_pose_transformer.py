@@ -91,7 +91,7 @@ def test_a_gap_longer_than_the_training_windows_is_left_and_reported():
 
 
 def windows(count=3, frames=30):
-    drawn = PoseWindows(corpus(2, 80), evenness=0.0).draw(count, frames, torch.Generator().manual_seed(0))
+    drawn = PoseWindows(corpus(2, 80)).draw(count, frames, torch.Generator().manual_seed(0))
     return add_targets(drawn)
 
 

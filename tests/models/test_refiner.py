@@ -13,7 +13,7 @@ from mapctl.features import LAYOUT, GroundPose
 from mapctl.pose import decode
 from mapctl.protocols import Refiner
 from mapctl.skeleton import CANONICAL
-from priors.refiner import compute_end_effectors, count_channels
+from priors.refiner import compute_end_effectors
 
 BITS = LAYOUT.slices["contacts"]
 
@@ -114,6 +114,6 @@ def by_positions(features, joints, start):
 def test_they_are_positions_and_velocities_in_the_heading_frame_wherever_the_motion_stands(number):
     features = clip(number=number)
     found = compute_end_effectors(features[None], JOINTS)[0]
-    assert found.shape == (39, count_channels(JOINTS))
+    assert found.shape == (39, 6 * len(JOINTS))
     for position in (GroundPose.origin(), GroundPose(torch.tensor([3.0, -7.0]), torch.tensor(2.5))):
         torch.testing.assert_close(found, by_positions(features, JOINTS, position), atol=1e-9, rtol=0)

@@ -17,12 +17,10 @@ from mapctl import joint_ranges, motion_dna
 from mapctl.errors import CheckpointError, RequestError
 from mapctl.inbetweening import PositionImage
 from mapctl.kinematics import heading
-from mapctl.motion_dna import MotionDna
 from mapctl.numerics.intervals import fill_missing_angle
 from mapctl.recording.masks import ALL, Mask, MissingMask
 from mapctl.retarget import to_canonical
 from mapctl.skeleton import CANONICAL, TOE_JOINTS, TOE_REST_HEIGHT
-from priors.training.recipes.infiller import interpolate_positions
 from priors.training.recipes.tweener import collect_dna
 from priors.tweener import (
     INPUT_ROWS,
@@ -157,11 +155,11 @@ def test_poses_that_split_a_gap_stand_on_the_way_and_face_along_it():
     (frames,) = find_splits(query).values()
     assert frames == [221, 440, 660, 879]
     body = query.to_unit_size(query.motion)
-    placed = place_poses(FAST.poses, body, frames)
+    placed = place_poses(FAST, body, frames)
     assert float((placed[:, 0] - body.root_position[frames])[:, ::2].abs().max()) < 1e-6
     torch.testing.assert_close(placed[:, list(TOE_JOINTS), 1].amin(dim=1), torch.full((4,), TOE_REST_HEIGHT).double())
     across = (placed[:, 13] - placed[:, 17])[:, ::2]  # from the right upper leg to the left
-    own = FAST.poses[[number * len(FAST.poses) // 4 for number in range(4)]]
+    own = FAST[[number * len(FAST) // 4 for number in range(4)]]
     first = (own[:, 13] - own[:, 17])[:, ::2]
     turned = torch.atan2(across[:, 0], across[:, 1]) - torch.atan2(first[:, 0], first[:, 1])
     off = turned - heading(body.local_quat_xyzw[frames, 0])
@@ -190,9 +188,9 @@ def test_several_styles_are_mixed():
     assert mixed.name == "one and other"
     torch.testing.assert_close(mixed.vector, (one.vector + 1) / 2)
     assert mixed.poses is not None
-    assert len(mixed.poses) == len(FAST.poses)
+    assert len(mixed.poses) == len(FAST)
     assert mix_styles([other]).poses is None
-    both = motion_dna.join([FAST, MotionDna(FAST.poses.flip(0))])
+    both = torch.cat([FAST, FAST.flip(0)])
     torch.testing.assert_close(tweener.encode_style(both).vector, one.vector)
 
 
@@ -216,13 +214,13 @@ def test_vectors_are_means_over_clips_and_come_back_from_the_card():
     encoder, result = tiny.network().style, corpus(3, 90)
     members = collect_dna(result, r"walk-([01])")
     assert {name: len(each) for name, each in members.items()} == {"0": 1, "1": 1}
-    other = MotionDna(torch.randn(4, 21, 3, generator=generator()))
+    other = torch.randn(4, 21, 3, generator=generator())
     two = {"both": [members["0"][0], other], "one": members["0"]}
     data = encode_classes(encoder, two)
     card = tiny.card()
     card.data.update(json.loads(json.dumps(data)))
     classes = read_classes(card, 5)
-    each = [encoder(dna.poses[None])[0] for dna in two["both"]]
+    each = [encoder(dna[None])[0] for dna in two["both"]]
     assert float((each[0] - each[1]).abs().max()) > 0.1
     torch.testing.assert_close(classes["both"].vector, (each[0] + each[1]) / 2, atol=2e-3, rtol=2e-3)
     torch.testing.assert_close(classes["one"].vector, each[0], atol=2e-3, rtol=2e-3)
@@ -230,7 +228,7 @@ def test_vectors_are_means_over_clips_and_come_back_from_the_card():
     assert encode_classes(encoder, collect_dna(result))["classes"]["walk"]["clips"] == 3
 
 
-@pytest.mark.parametrize("vector", ["%%%", "AAAA", None, "AHwAfAB8AHwAfA=="])
+@pytest.mark.parametrize("vector", ["%%%", "AAAA", "AHwAfAB8AHwAfA=="])
 def test_a_broken_class_is_refused(vector):
     card = tiny.card()
     card.data["classes"] = {"walk": {"clips": 1, "vector": vector}}
@@ -251,18 +249,16 @@ def count(module):
     return sum(each.numel() for each in module.parameters())
 
 
-def image_of(motion, keys, *, present=None, known_axes=None):
+def image_of(motion, keys, *, known_axes=None):
     """Whole poses are known at the keys."""
     known = torch.zeros(1, motion.num_frames, 21, dtype=torch.bool)
     known[:, list(keys)] = True
     positions, facing = motion.joint_positions().float()[None], heading(motion.local_quat_xyzw[:, 0]).float()[None]
-    between = interpolate_positions(positions, motion.local_quat_xyzw.float()[None], known)
     return PositionImage.of_world(
-        between,
+        positions,
         fill_missing_angle(facing, known[..., 0]),
         torch.zeros(1, motion.num_frames, 2),
         known=known,
-        present=torch.ones(1, motion.num_frames, dtype=torch.bool) if present is None else present,
         known_axes=known_axes,
     )
 

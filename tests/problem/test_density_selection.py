@@ -31,7 +31,7 @@ class Flat(ToyDensity):
     def reference_log_density(self):
         return self.usual
 
-    def log_prob(self, features, state, *, inputs=None):
+    def log_prob(self, features, state):
         return torch.full(features.shape[:2], self.nats)
 
 

@@ -1,6 +1,7 @@
 """Windows and copies of clips, mirrored, at other tempos and in unfamiliar poses: they are motions."""
 
 import math
+from dataclasses import replace
 from fractions import Fraction
 
 import pytest
@@ -13,6 +14,7 @@ from mapctl import rotations
 from mapctl.contacts import ContactSettings
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode
 from mapctl.inbetweening.missing import interpolate_missing
+from mapctl.inbetweening.partial_motion import KnownParts
 from mapctl.motion import Motion
 from mapctl.pose import BodyPose, decode
 from mapctl.recording.masks import MissingMask
@@ -20,7 +22,7 @@ from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.training.augment import add_copies, copy_clip
 from priors.training.data import Corpus
 from priors.training.recipes.infiller import show_known
-from priors.training.windows import PaddedWindows, PoseVariation, PoseWindows, vary_features
+from priors.training.windows import PoseVariation, PoseWindows, vary_features
 
 
 def decoded(features):
@@ -48,7 +50,7 @@ def seen_from_the_root(motion):
 
 def test_a_window_is_the_motion_from_that_frame_on():
     data = corpus(3, 60)
-    found = PoseWindows(data, evenness=0.0).at(torch.tensor([1, 2]), torch.tensor([10, 36]), 24, torch.ones(2))
+    found = PoseWindows(data).at(torch.tensor([1, 2]), torch.tensor([10, 36]), 24, torch.ones(2))
     positions = found.world_poses()[0]
     for row, (clip, first) in enumerate(((1, 10), (2, 36))):
         features = data.features[60 * clip : 60 * (clip + 1)]
@@ -61,7 +63,7 @@ def test_a_window_is_the_motion_from_that_frame_on():
 
 
 def test_a_mirrored_window_is_the_window_in_a_mirror():
-    plain = PoseWindows(corpus(3, 60), evenness=0.0).at(torch.tensor([2]), torch.tensor([20]), 30, torch.ones(1))
+    plain = PoseWindows(corpus(3, 60)).at(torch.tensor([2]), torch.tensor([20]), 30, torch.ones(1))
     positions = plain.mirrored().world_poses()[0]
     # The walk itself in a mirror, but for where it starts and faces.
     wanted = seen_from_the_root(walks(3, 60)[2].mirror())[20:50]
@@ -69,24 +71,17 @@ def test_a_mirrored_window_is_the_window_in_a_mirror():
     assert (without_heading(local, plain.mirrored().heading[0]) - wanted).norm(dim=-1).max() < 1e-4
 
 
-@pytest.mark.parametrize("frames", [40, 90])
-def test_a_shorter_clip_lies_whole_in_a_padded_window(frames):
-    motion, present = PaddedWindows(corpus(3, 60), frames=frames, evenness=0.0).draw(20, generator())
-    assert present.sum(dim=1).tolist() == [min(frames, 60)] * 20
-    assert bool(motion.world_poses()[0].isfinite().all())
-
-
 def test_the_guess_in_a_gap_is_the_one_that_filling_starts_from():
     """From the rotations of a batch, and of a motion on its rig, bent by the velocities beside the gap, too."""
-    shown = PoseWindows(corpus(3, 60), evenness=0.0).at(torch.tensor([1]), torch.tensor([3]), 40, torch.ones(1))
-    known = torch.ones(1, 40, CANONICAL.num_joints, dtype=torch.bool)
+    shown = PoseWindows(corpus(3, 60)).at(torch.tensor([1]), torch.tensor([3]), 40, torch.ones(1))
+    known = torch.ones(1, 40, dtype=torch.bool)
     known[:, 10:25] = False
     quats = rotations.from_matrix(shown.local_matrices()[0].double())
     motion = Motion(CANONICAL, Fraction(30), shown.root_position[0].double(), quats)
-    gone = ~known[0, :, 0]
+    gone = ~known[0]
     lost = MissingMask(gone[:, None].expand(-1, CANONICAL.num_joints), gone)
     wanted = interpolate_missing(motion, lost).joint_positions()
-    image, _ = show_known(shown, torch.ones(1, 40, dtype=torch.bool), known)
+    image, _ = show_known(shown, replace(shown, known=KnownParts.whole(known)))
     torch.testing.assert_close(image.to_world(image.positions)[0].double(), wanted, atol=0.05, rtol=0)
 
 
@@ -108,7 +103,7 @@ def clips():
 
 @pytest.fixture(scope="module")
 def windows(clips):
-    return PoseWindows(clips, evenness=0.0)
+    return PoseWindows(clips)
 
 
 def decode_feet(features):

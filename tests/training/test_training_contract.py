@@ -151,7 +151,7 @@ def test_training_ends_where_validation_no_longer_improves_with_the_best_weights
 
         def validate(corpus):
             seen[trainer.step] = {key: value.clone() for key, value in trainer.network.state_dict().items()}
-            return {"V1_cm": scores[trainer.step]}
+            return {"loss": scores[trainer.step]}
 
         trainer.validate = validate
         return trainer

@@ -29,6 +29,7 @@ from priors.training.data import (
     Corpus,
     Cut,
     FrameCuts,
+    compute_feature_statistics,
     find_floor_slope,
     follow_paces,
     measure_pace_changes,
@@ -38,12 +39,7 @@ from priors.training.data import (
     turn_level,
 )
 from priors.training.recipes.denoiser import DenoiserTrainer
-from priors.training.recipes.lstm_gmm import (
-    DensityTrainer,
-    compute_feature_statistics,
-    measure_data_limits,
-    select_initial_states,
-)
+from priors.training.recipes.lstm_gmm import DensityTrainer, measure_data_limits, select_initial_states
 
 
 def test_the_corpus_is_the_features_of_the_clips_and_is_read_once(tmp_path, data, monkeypatch):

@@ -6,6 +6,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 import priors
 from controllers.inbetweening import proposers
 from controllers.inbetweening.proposers import AutoInbetweener, ModelLoaders
@@ -15,7 +17,6 @@ from mapctl.commands.shared import inputs, options, outputs
 from mapctl.errors import RequestError
 from mapctl.metrics import make_comparable
 from mapctl.motion import Motion
-from mapctl.motion_dna import MotionDna
 from mapctl.problem.solution import Solution
 from mapctl.protocols import Inbetweener
 from mapctl.retarget.rigs import Rig
@@ -23,7 +24,7 @@ from priors.stitcher import Stitcher
 from priors.tweener import Style, Tweener, mix_styles, pick_class
 from scenes.film import film_side_by_side
 
-Examples = Sequence[tuple[str, MotionDna | None]]
+Examples = Sequence[tuple[str, Tensor | None]]
 """Name and poses of each motion file whose style is requested; without poses the name of a class."""
 
 
@@ -37,7 +38,7 @@ def read_dna(command: options.ProposalOptions) -> Examples:
     names = [name.strip() for name in command.dna.split(",")]
     if not all(names):
         raise RequestError(f"--dna takes motion files and classes with a comma between two, got {command.dna!r}")
-    found: list[tuple[str, MotionDna | None]] = []
+    found: list[tuple[str, Tensor | None]] = []
     for name in names:
         path = Path(name)
         if not path.is_file() and path.suffix.lower() not in formats.READERS:

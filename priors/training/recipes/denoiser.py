@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -17,7 +16,16 @@ from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.denoiser import DenoiserConfig, DenoiserNetwork
 from priors.training.augment import corrupt, make_clean_capture
 from priors.training.data import Corpus, Split
-from priors.training.loop import Count, GradientTrainer, MaybeCount, NetworkSettings, Row, make_generator
+from priors.training.loop import (
+    VALIDATED_BATCHES,
+    Count,
+    GradientTrainer,
+    MaybeCount,
+    NetworkSettings,
+    Row,
+    average_rows,
+    make_generator,
+)
 from priors.training.windows import FeatureWindows, PoseVariation, measure_lengths, vary_features
 
 # Weights beside that of the position error, cm, which is 1.
@@ -64,24 +72,19 @@ class DenoiserTrainer(GradientTrainer[DenoiserNetwork]):
         self.begin()
 
     def losses(self) -> dict[str, Tensor]:
-        windows = draw_performers(self.windows, self.settings.batch, self.generator)
-        return compute_denoiser_losses(self.network, windows, self.generator)
+        return self._compare(self.windows, self.generator)
 
     @torch.no_grad()
-    def validate(self, corpus: Corpus) -> dict[str, Any]:
-        """Measure the errors on 6 batches of held-out windows, corrupted identically each time."""
-        settings, generator, rows = self.settings, make_generator(0), []
+    def validate(self, corpus: Corpus) -> Row:
+        """Measure the losses of unseen windows, drawn and corrupted alike each time."""
         # What is held out may have no clip as long as a window; that must not end a run after an hour.
-        drawn = FeatureWindows(corpus, min(settings.window, max(corpus.lengths)), evenness=_EVENNESS)
-        for _ in range(6):
-            windows = draw_performers(drawn, settings.batch, generator)
-            rows.append(compute_denoiser_losses(self.network, windows, generator))
-        means = torch.stack([torch.stack(list(row.values())) for row in rows]).mean(dim=0)
-        return dict(zip(rows[0], means.tolist(), strict=True))
+        windows = FeatureWindows(corpus, min(self.settings.window, max(corpus.lengths)), evenness=_EVENNESS)
+        generator = make_generator(0)
+        return average_rows([self._compare(windows, generator) for _ in range(VALIDATED_BATCHES)])
 
-    def score(self, row: Row) -> float:
-        """Return the loss of unseen windows."""
-        return row.get("loss") or math.nan
+    def _compare(self, windows: FeatureWindows, generator: torch.Generator) -> dict[str, Tensor]:
+        drawn = draw_performers(windows, self.settings.batch, generator)
+        return compute_denoiser_losses(self.network, drawn, generator)
 
 
 def draw_performers(

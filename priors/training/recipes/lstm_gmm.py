@@ -20,7 +20,7 @@ from tyro.conf import arg
 
 from mapctl import rotations
 from mapctl.errors import RequestError
-from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed, integrate_root, mirror_features
+from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed, integrate_root
 from mapctl.metrics import compute_reference
 from mapctl.pose import decode
 from mapctl.problem import density_selection
@@ -39,7 +39,7 @@ from priors.training.critics import (
     moment_loss,
     run_free,
 )
-from priors.training.data import Corpus, Split, follow_paces, measure_pace_changes
+from priors.training.data import Corpus, Split, compute_feature_statistics, follow_paces, measure_pace_changes
 from priors.training.loop import (
     Count,
     Export,
@@ -68,7 +68,6 @@ _CRITIC_UPDATES, _CRITIC_HEAD_START = 2, 400  # updates of the critic in a step,
 _CRITIC_RATE = 3e-4  # learning rate of the density while the critic judges
 _CRITIC_RISE, _CRITIC_FALL = 20, 0.3  # steps in which it rises, share of the steps in which it falls to nothing
 _AVERAGE = 0.995  # share of the past in the running mean of the weights while the critic judges
-_UNTAUGHT = {"critic": 2 * math.log(2), "accuracy": 0.5}  # of a critic that has learnt nothing
 _SECOND = PRIOR_FPS  # frames
 _WARM_UP_FRAMES = 40  # frames of a clip before a start; the memory has settled by then
 _SETTLING_FRAMES = 300
@@ -106,8 +105,8 @@ class DensitySettings(NetworkSettings):
     """Last steps in which a critic joins that separates a second of a free run from captured motion, and the density is
     trained to pass as well; what is kept is then the running mean of the weights."""
     standing_share: Number = 1.0
-    """Share of the windows of standing characters that training sees, 1 by default: below it for motion that mostly
-    stands, whose density is hard to steer into a walk otherwise."""
+    """How often windows of standing characters are drawn, as a share of others: below 1 for motion that mostly stands,
+    whose density is hard to steer into a walk otherwise."""
 
     def __post_init__(self):
         super().__post_init__()
@@ -164,14 +163,15 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         self.begin()
         self.critic_trainer: CriticTrainer | None = None
         self.average = self.network
-        """Moving average of the weights since the critic joined, the weights themselves without one."""
+        """Moving average of the weights since the critic joined."""
         if settings.critic_steps:
             self.critic_trainer = CriticTrainer(self.windows, seed=settings.seed)
             self.average = copy.deepcopy(self.network).requires_grad_(False)
 
     @property
     def exported(self) -> LstmGmm:
-        return self.average
+        joined = self.critic_trainer is not None and self.critic_trainer.history is not None
+        return self.average if joined else self.network
 
     def networks(self) -> dict[str, nn.Module]:
         critic = {} if self.critic_trainer is None else {"average": self.average, "critic": self.critic_trainer.network}
@@ -197,11 +197,8 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
         if self.critic_trainer is not None and self._criticised == 0:
             self._introduce(self.critic_trainer)
         parts = super().train_step()
-        if self.critic_trainer is None:
+        if self.critic_trainer is None or self.critic_trainer.history is None:
             return parts
-        if self.critic_trainer.history is None:
-            self.average.load_state_dict(self.network.state_dict())
-            return {**parts, **_UNTAUGHT}
         parts |= self.critic_trainer.learn(self.step, _CRITIC_UPDATES, self.generator)
         update_average(self.average, self.network, min(_AVERAGE, self._criticised / (self._criticised + 20)))
         return parts
@@ -229,20 +226,16 @@ class DensityTrainer(GradientTrainer[LstmGmm]):
 
     def validate(self, corpus: Corpus) -> dict[str, float]:
         """Measure the likelihood and the health of free runs."""
-        self.average.eval()
-        row = {"validation_nats": compute_validation_nats(self.average, corpus)}
-        row |= measure_free_runs(self.average, corpus)
-        self.average.train()
-        return row
+        nats = compute_validation_nats(self.exported, corpus)
+        return {"validation_nats": nats, **measure_free_runs(self.exported, corpus)}
 
     def score(self, row: Row) -> float:
         """Return the negative log density of unseen clips, nats a frame."""
-        found = row.get("validation_nats")
-        return math.nan if found is None else found
+        return row.get("validation_nats") or math.nan
 
     def export(self, parts: Split) -> Export:
         """The network with moments to start from, and what the data show to be possible."""
-        model, settings = self.average.eval(), self.settings
+        model, settings = self.exported, self.settings
         known = density.read_labels(parts.train.names, settings.labels)
         found = select_initial_states(
             model, parts.train, count=_STARTS, generator=make_generator(settings.seed), labels=known.held
@@ -526,18 +519,3 @@ def compute_window_nats(model: LstmGmm, corpora: Iterable[Corpus]) -> dict[str, 
             ]
     values = torch.stack(found)
     return {"mean": float(values.mean()), "p2": float(values.quantile(0.02))}
-
-
-def compute_feature_statistics(features: Float[Tensor, "frames size"]) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of features and their mirror image; floors keep held joints from exploding.
-
-    Rotations are held to at least 0.01 rad (0.6 degrees), displacements to 1 mm; contact bits map to -1 and 1.
-    """
-    both = torch.cat([features, mirror_features(features)])
-    mean, std = both.mean(0), both.std(0)
-    floor = torch.full_like(std, 0.01)
-    floor[LAYOUT.slices["root_displacement_heading"]] = 0.001
-    floor[LAYOUT.slices["heading_change"]] = 0.002
-    for values in (mean, floor, std):
-        values[LAYOUT.slices["contacts"]] = 0.5
-    return mean, torch.maximum(std, floor)

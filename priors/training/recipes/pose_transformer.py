@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -13,28 +12,21 @@ from mapctl import rotations
 from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts, PartialMotion
 from mapctl.numerics import gaussian
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
-from priors.pose_transformer import QUANTILES, PoseTransformerConfig, PoseTransformerNetwork, ProposedPoses
+from priors.pose_transformer import (
+    QUANTILES,
+    PoseTransformer,
+    PoseTransformerConfig,
+    PoseTransformerNetwork,
+    ProposedPoses,
+)
 from priors.training.augment import Draws
 from priors.training.data import Corpus, Split
-from priors.training.loop import (
-    Count,
-    Export,
-    GradientTrainer,
-    NetworkSettings,
-    Number,
-    Row,
-    geometric_mean,
-    make_adam,
-    make_generator,
-)
-from priors.training.windows import PoseVariation, PoseWindows, add_targets, measure_lengths
+from priors.training.gaps import InbetweenerTrainer
+from priors.training.loop import Count, Export, NetworkSettings, Number, make_adam, make_generator
+from priors.training.windows import TEMPO, PoseVariation, PoseWindows, add_targets, draw_length, measure_lengths
 
-VALIDATED_GAPS = (5, 15, 30, 45, 60, 120)
-"""Gaps that are validated, frames."""
 _SHORTEST_WINDOW = 8  # frames
-_VALIDATED_WINDOWS = 128
-_UNFAMILIAR, _UNFAMILIAR_GAPS = PoseVariation(share=1.0), (5, 15, 30)
-_CALIBRATED_FRAMES = (10, 20, 40, 60, 90)
+_CALIBRATED_WINDOWS, _CALIBRATED_FRAMES = 128, (10, 20, 40, 60, 90)
 _MIN_STD_ROTATION, _MIN_STD_POSITION = 0.1, 0.05
 _JOINTS = CANONICAL.num_joints
 _TRUNK = torch.isin(torch.arange(_JOINTS), torch.tensor(CANONICAL.indices(("spine", "chest", "neck", "head"))))
@@ -48,7 +40,6 @@ _HIPS = 5.0  # of the distance of the hips, metres
 _FEET = 5.0  # of the planted toes' steps, metres a frame
 _CONTACTS = 0.05  # of the contacts' cross entropy, nats
 _EASE = 0.4  # how much windows count for more whose interpolation errs little: 0 all alike, 1 by the share of its error
-_EVENNESS = 0.85  # of windows among kinds of clips: 0 by their frames, 1 the same number from each
 
 # What stays known: a window has gaps, lost joints, or keys.
 _LOST = 0.22  # share of windows that lose joints
@@ -83,11 +74,13 @@ class PoseTransformerSettings(NetworkSettings):
         return PoseTransformerTrainer(self, parts.train)
 
 
-class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
+class PoseTransformerTrainer(InbetweenerTrainer[PoseTransformerNetwork]):
     """Draws windows, hides parts of them, and brings the network nearer to proposing them."""
 
+    model, gaps = PoseTransformer, (5, 15, 30, 45, 60, 120)
+
     def __init__(self, settings: PoseTransformerSettings, corpus: Corpus):
-        self.windows = PoseWindows(corpus, evenness=_EVENNESS)
+        self.windows = PoseWindows(corpus)
         self.longest = min(settings.window, int(self.windows.lengths.max()) * 9 // 10 - 1)
         self.config = settings.find_config()
         super().__init__(settings, lambda: PoseTransformerNetwork(self.config, bfloat16=settings.bfloat16))
@@ -109,37 +102,10 @@ class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
         return {"optimiser": make_adam(others, self.settings.learning_rate), "muon": muon}
 
     def losses(self) -> dict[str, Tensor]:
-        share = float(torch.rand((), generator=self.generator))
-        frames = round(_SHORTEST_WINDOW * (self.longest / _SHORTEST_WINDOW) ** share)
+        frames = draw_length(_SHORTEST_WINDOW, self.longest, self.generator)
         batch = max(1, self.settings.batch // frames)
         truth = add_targets(self.windows.draw(batch, frames, self.generator, variation=PoseVariation()))
         return compute_losses(self.network, truth, sample_known_parts(truth, self.generator))
-
-    @torch.no_grad()
-    def validate(self, corpus: Corpus) -> dict[str, Any]:
-        """Measure the error of gaps in unseen windows after 10 frames and after one, before one frame, cm and as a
-        share of the interpolation's; the same in unfamiliar poses; and of lost arms."""
-        windows, row = PoseWindows(corpus, evenness=1.0), {}
-        cases = [(f"{past}_{gap}", past, gap, None) for past in (10, 1) for gap in VALIDATED_GAPS]
-        cases += [(f"unfamiliar_{gap}", 10, gap, _UNFAMILIAR) for gap in _UNFAMILIAR_GAPS]
-        for name, past, gap, variation in cases:
-            if past + gap + 1 <= int(windows.lengths.max()):
-                frames = past + gap + 1
-                truth = windows.draw(_VALIDATED_WINDOWS, frames, make_generator(gap), variation=variation)
-                observed = torch.ones(truth.heading.shape, dtype=torch.bool)
-                observed[:, past : past + gap] = False
-                known = KnownParts.whole(observed)
-                row[f"error_{name}_cm"], row[f"share_{name}"] = measure_error(self.network, truth, known)
-        truth = windows.draw(_VALIDATED_WINDOWS, min(60, int(windows.lengths.max())), make_generator(1))
-        known = KnownParts.whole(torch.ones(truth.heading.shape, dtype=torch.bool))
-        lost = known.rotations.clone()
-        lost[..., [CANONICAL.index(name) for name in ("leftUpperArm", "leftLowerArm", "leftHand")]] = False
-        row["error_arm_cm"], row["share_arm"] = measure_error(self.network, truth, replace(known, rotations=lost))
-        return row
-
-    def score(self, row: Row) -> float:
-        """Return the error of unseen windows over the interpolation's, geometric mean over gaps and lost arms."""
-        return geometric_mean(value for name, value in row.items() if name.startswith("share_"))
 
     @torch.no_grad()
     def export(self, parts: Split) -> Export:
@@ -155,11 +121,11 @@ class PoseTransformerTrainer(GradientTrainer[PoseTransformerNetwork]):
 
 def _measure_spread(network: PoseTransformerNetwork, corpus: Corpus, seed: int) -> list[Tensor]:
     """Measure by quantile the logarithm of errors over the spread."""
-    generator, windows = make_generator(seed), PoseWindows(corpus, evenness=1.0)
+    generator, windows = make_generator(seed), PoseWindows(corpus)
     found: list[Tensor] = []
     for frames in _CALIBRATED_FRAMES:
-        if frames <= int(windows.lengths.max()):
-            truth = add_targets(windows.draw(_VALIDATED_WINDOWS, frames, generator, variation=PoseVariation()))
+        if frames * (1 + TEMPO) < int(windows.lengths.max()):
+            truth = add_targets(windows.draw(_CALIBRATED_WINDOWS, frames, generator, variation=PoseVariation()))
             shown = hide(network, sample_known_parts(truth, generator))
             proposed = network(shown)
             distance = (proposed.poses(truth.offsets)[0] - truth.world_poses()[0]).norm(dim=-1)
@@ -173,19 +139,6 @@ def hide(network: PoseTransformerNetwork, motion: PartialMotion) -> PartialMotio
     toes = motion.known.positions[..., list(TOE_JOINTS)]
     shown = replace(motion, contacts=torch.where(toes, motion.contacts, 0.5))
     return network.interpolate(shown)
-
-
-@torch.no_grad()
-def measure_error(network: PoseTransformerNetwork, truth: PartialMotion, known: KnownParts) -> tuple[float, float]:
-    """Measure the mean distance of unknown joints from the truth, cm, and as a share of the interpolation's."""
-    shown = hide(network, replace(truth, known=known))
-    unknown = ~known.positions
-    positions = truth.world_poses()[0]
-    errors = [
-        float(((generated - positions).norm(dim=-1) * unknown).sum() / unknown.sum())
-        for generated in (network(shown).poses(truth.offsets)[0], shown.world_poses()[0])
-    ]
-    return 100 * errors[0], errors[0] / errors[1]
 
 
 def compute_losses(network: PoseTransformerNetwork, truth: PartialMotion, hidden: PartialMotion) -> dict[str, Tensor]:

@@ -21,7 +21,7 @@ from priors.checkpoints import require_at_least
 from priors.lstm_gmm.density import LstmGmmDensity
 from priors.refiner import PAPER, LstmRefiner, RefinerConfig, RefinerNetwork, compute_end_effectors
 from priors.training.critics import WINDOW_MOMENTS, EndEffectorCritic, HistoryBuffer, moment_loss
-from priors.training.data import Corpus, Split, find_window_starts
+from priors.training.data import Corpus, Split, compute_feature_statistics, find_window_starts
 from priors.training.loop import (
     Count,
     Export,
@@ -46,7 +46,6 @@ _WARM_UP = 75  # updates of each before the rounds (section 4.2.2)
 # Updates of the critic before anything else (the paper's 0): a refiner led by a critic that has learnt nothing harms
 # samples that were nearly good.
 _HEAD_START = 200
-_CRITIC_WIDTH = 128  # units of the critic's layers (the paper's 500)
 _CRITIC_UPDATES = 2  # updates of the critic in each round (the paper's 1)
 _REFINER_UPDATES = 1  # initial updates of the refiner in each round (the paper's 5); doubled and halved as either wins
 _STRONG, _WEAK = 0.01, 1.0  # critic's loss below which the refiner's updates are doubled, and above which halved
@@ -54,8 +53,6 @@ _MOST_UPDATES = 20  # they are never more than this
 _HISTORY = 320  # refined windows kept for the critic
 _ROOT = 20.0  # weight of the squared distance between the root trajectories before and after (Eq. 13), per m^2
 _REFINER_RATE, _CRITIC_RATE = 1e-4, 5e-4  # learning rates (the paper's 0.002 and 0.005)
-_CRITIC_AROUND = 2  # frames on either side that its first layer sees (the paper's 0): jitter takes three frames
-_CRITIC_SLOW = 0.05  # ground speed of feet, m/s, below which the critic sees it magnified
 _MOMENTS = 10.0  # weight of feet, jerk and spread: the critic alone lets feet slide while it is still learning
 _AVERAGE = 0.99  # share of the past in the running mean of the refiner's weights, which is what is kept
 
@@ -139,12 +136,7 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
         statistics = compute_statistics(corpus, self.config, settings.window)
         reach = {name: statistics[name] for name in ("reach_mean", "reach_std")}
         self.refiner, self.critic = draw_weights(
-            lambda: (
-                RefinerNetwork(self.config, **statistics),
-                EndEffectorCritic(
-                    self.config.joints, width=_CRITIC_WIDTH, around=_CRITIC_AROUND, slow=_CRITIC_SLOW, **reach
-                ),
-            ),
+            lambda: (RefinerNetwork(self.config, **statistics), EndEffectorCritic(self.config.joints, **reach)),
             settings.seed,
         )
         self.network = deepcopy(self.refiner).requires_grad_(False)
@@ -219,7 +211,9 @@ class AdversarialTrainer(Trainer[RefinerNetwork]):
         """One update of the critic (Eq. 10) on captured windows, fresh refined ones and kept ones."""
         with torch.no_grad():
             fresh, _ = self.refiner(self._draw(self.raw))
-        generated = self.history.mix(fresh, self.generator)
+        half = len(fresh) // 2
+        generated = torch.cat([fresh[half:], self.history.draw(half, self.generator)])
+        self.history.keep(fresh[:half], self.generator)
         odds = self.critic(torch.cat([self._draw(self.captured), generated]))
         truth = torch.cat([torch.ones(len(odds) - len(generated)), torch.zeros(len(generated))])
         loss = cross_entropy(odds, truth[:, None].expand_as(odds))
@@ -274,9 +268,7 @@ def compute_root_error(before: Tensor, after: Tensor) -> Tensor:
 def compute_statistics(corpus: Corpus, config: RefinerConfig, window: int) -> dict[str, Tensor]:
     """Mean and spread of features and end effectors over captured clips, with floors that keep held joints in hand."""
     features = corpus.features
-    mean, std = features.mean(0), features.std(0).clamp(min=0.002)
-    bits = LAYOUT.slices["contacts"]
-    mean[bits], std[bits] = 0.5, 0.5
+    mean, std = compute_feature_statistics(features)
     starts = find_window_starts(corpus.lengths, window)[:: max(1, window)]
     reach = torch.cat(
         [

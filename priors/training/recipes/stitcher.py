@@ -6,7 +6,7 @@ Validation measures, between poses of unseen clips, how near the answers come.
 import copy
 import itertools
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -28,6 +28,7 @@ from priors.stitcher import (
     Gaussian,
     PosteriorNetwork,
     Sides,
+    Stitcher,
     StitcherConfig,
     StitcherNetwork,
     count_generated,
@@ -36,16 +37,8 @@ from priors.stitcher import (
     walk_sides,
 )
 from priors.training.data import Corpus, Split
-from priors.training.loop import (
-    Count,
-    Export,
-    GradientTrainer,
-    NetworkSettings,
-    Row,
-    geometric_mean,
-    make_generator,
-    update_average,
-)
+from priors.training.gaps import InbetweenerTrainer
+from priors.training.loop import Count, Export, NetworkSettings, make_generator, update_average
 from priors.training.windows import WindowPicker, measure_lengths
 
 _SHORTEST, _FIRST_LONGEST = 2, 8  # frames from pose to pose
@@ -53,7 +46,6 @@ _LEAST_WINDOW = 16  # frames of the longest transition
 _CONTEXT = 10  # frames known before or after, at most
 _LENGTH_GROWTH = 0.5  # share of training in which transitions become longer
 _AVERAGE = 0.999
-_EVENNESS = 0.85  # of windows among kinds of clips: 0 by their frames, 1 the same number from each
 _LEAST_SPREAD = 0.05  # of a feature, of the typical one of its block
 _EASE = 0.4  # power of the interpolation's error by which windows count less
 _EASE_METRES = 0.05  # error at which they count 1
@@ -103,15 +95,18 @@ class StitcherSettings(NetworkSettings):
         return StitcherTrainer(self, parts.train)
 
 
-class StitcherTrainer(GradientTrainer[StitcherNetwork]):
+class StitcherTrainer(InbetweenerTrainer[StitcherNetwork]):
     """Draws transitions, hides what is between their ends, and brings both sides nearer to it."""
+
+    model = Stitcher
 
     def __init__(self, settings: StitcherSettings, corpus: Corpus):
         self.config = config = settings.find_config()
-        self.windows = TransitionWindows(corpus, evenness=_EVENNESS)
+        self.windows = TransitionWindows(corpus)
         self.longest = min(config.longest, settings.window, max(corpus.lengths) - 2 * _CONTEXT - 1)
         if self.longest < _SHORTEST:
             raise RequestError(f"a stitcher needs clips of {_SHORTEST + 2 * _CONTEXT + 1} frames and more")
+        self.gaps = tuple(gap for gap in VALIDATED_GAPS if gap < config.longest)
         device = torch.get_default_device()
         super().__init__(settings, lambda: self._make(config, device))
         _set_moments(self.network, corpus)
@@ -153,18 +148,9 @@ class StitcherTrainer(GradientTrainer[StitcherNetwork]):
         update_average(self.average, self.network, min(_AVERAGE, (1 + self.step) / (10 + self.step)))
         return parts
 
-    @torch.no_grad()
-    def validate(self, corpus: Corpus) -> dict[str, Any]:
-        return measure_transitions(self.average, TransitionWindows(corpus, evenness=1.0))
-
-    def score(self, row: Row) -> float:
-        """Return the error of the calm answer to unseen transitions over the interpolation's, geometric mean over
-        lengths, after a pose and after ten frames."""
-        return geometric_mean(value for name, value in row.items() if name.startswith(("bare_", "past_")))
-
     def export(self, parts: Split) -> Export:
         """Return the average of the weights, with draws as wide as they come near to the truth."""
-        windows = TransitionWindows(parts.validation, evenness=1.0)
+        windows = TransitionWindows(parts.validation)
         self.average.temperature.fill_(calibrate_temperature(self.average, windows))
         return super().export(parts)
 
@@ -229,13 +215,12 @@ class Transition:
 class TransitionWindows:
     """Draws transitions from a corpus, half of them mirrored."""
 
-    def __init__(self, corpus: Corpus, *, evenness: float):
-        """`evenness` among kinds of clips, as `WindowPicker` takes it."""
+    def __init__(self, corpus: Corpus):
         self.features = corpus.features
         self.phases = torch.cat([compute_phases(LAYOUT.pick(clip, "contacts")) for clip in corpus.clips()]).to(
             self.features
         )
-        self.picker = WindowPicker(corpus, evenness=evenness)
+        self.picker = WindowPicker(corpus)
         self.starts = corpus.locate_clips()[1]
 
     def draw(self, batch: int, frames: int, known: Known, generator: torch.Generator) -> Transition:
@@ -406,27 +391,13 @@ def interpolate(truth: Transition) -> tuple[BodyPose, BodyPose]:
 
 
 @torch.no_grad()
-def measure_transitions(network: StitcherNetwork, windows: TransitionWindows) -> dict[str, float]:
-    """Measure calm answers to bare poses, and after 10 frames: mean distance of joints over the interpolation's."""
-    row: dict[str, float] = {}
-    for name, known in (("bare", Known()), ("past", Known(before=10))):
-        for gap in VALIDATED_GAPS:
-            if _has_room(network, windows, gap):
-                truth = windows.draw(_WINDOWS, gap + 1, known, make_generator(gap))
-                true, guess = (body.joints_world()[:, :-1] for body in interpolate(truth))
-                error = (place_answers(network, truth) - true).norm(dim=-1).mean()
-                row[f"{name}_{gap}"] = float(error / (guess - true).norm(dim=-1).mean())
-    return row
-
-
-@torch.no_grad()
 def calibrate_temperature(network: StitcherNetwork, windows: TransitionWindows) -> float:
     """Return the largest standard deviation of draws' noise with which the best of eight still comes as near to the
     truth as with any, within a hundredth: as different as can be without wandering off. In gaps between bare poses,
     which count by their calm answer's error."""
     scores = torch.zeros(len(TEMPERATURES))
     for gap in VALIDATED_GAPS[1:]:
-        if not _has_room(network, windows, gap):
+        if gap + 4 > int(windows.picker.lengths.max()) or gap >= network.config.longest:
             continue
         truth = windows.draw(_WINDOWS, gap + 1, Known(), make_generator(gap))
         true = interpolate(truth)[0].joints_world()[:, :-1]
@@ -448,10 +419,6 @@ def place_answers(
     joined = join_sides(walk_sides(network, truth.ends(), truth.frames, latents or calm))
     offsets = CANONICAL.offsets.to(joined.quats)
     return forward_kinematics(offsets, CANONICAL.parents, joined.root_position, joined.quats)[0]
-
-
-def _has_room(network: StitcherNetwork, windows: TransitionWindows, gap: int) -> bool:
-    return gap + 13 <= max(windows.picker.lengths.tolist()) and gap + 1 <= network.config.longest
 
 
 def _set_moments(network: StitcherNetwork, corpus: Corpus) -> None:

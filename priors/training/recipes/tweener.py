@@ -10,7 +10,7 @@ positions on the ground, and drawings seen from one side.
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -21,34 +21,27 @@ from tyro.conf import arg
 
 from mapctl import kinematics, motion_dna, rotations
 from mapctl.errors import RequestError
-from mapctl.inbetweening.partial_motion import KnownParts, PartialMotion, interpolate_partial_motion
+from mapctl.features import PRIOR_FPS
+from mapctl.inbetweening.partial_motion import PartialMotion
 from mapctl.inbetweening.position_image import mirror_positions
 from mapctl.inbetweening.root_trajectory import LocalMotion, RootTrajectory, compute_displacement_errors
-from mapctl.metrics.body import NOTHING, Liveliness, measure_liveliness, see_from_hips
-from mapctl.motion_dna import MotionDna
+from mapctl.metrics.body import see_from_hips
 from mapctl.numerics.intervals import last_observed, next_observed, true_intervals
 from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors import checkpoints
 from priors.path import ConvPathPredictor, PathNetwork
 from priors.training.data import Corpus, Split
-from priors.training.loop import (
-    Count,
-    Export,
-    GradientTrainer,
-    Name,
-    NetworkSettings,
-    Row,
-    geometric_mean,
-    make_generator,
-)
-from priors.training.windows import KINDS, PoseWindows, choose_rows, find_kind, measure_lengths
+from priors.training.gaps import InbetweenerTrainer
+from priors.training.loop import Count, Export, Name, NetworkSettings, Row, make_generator
+from priors.training.windows import PoseWindows, choose_rows, draw_length, measure_lengths
 from priors.tweener import (
     LABELS,
     PAPER,
     GeneratorConfig,
     GeneratorNetwork,
     GivenParts,
+    Tweener,
     encode_classes,
     find_class,
     make_key_image,
@@ -97,16 +90,11 @@ _ROLLS = 4096  # random numbers drawn at once
 _FIRST_LONGEST_GAP, _LONGEST_GAP = 30.0, 480.0  # frames when training begins, and grown up (paper: 600 at 60 fps)
 _SHORTEST_GAP = 30.0  # frames of the shortest longest gap of a sequence; the logarithm is drawn evenly
 _GROWN = 0.25  # share of training after which gaps grow no more
-_SPLICED_FROM = 90  # frames of the shortest gap with a splice, 3 s
+_SPLICED_FROM = 90  # frames of the shortest gap between keys of different clips, 3 s
 _RUNS, _RUN = 0.4, 12  # share of keys that are several frames, a pose and its pace, and their most frames
 _OPEN_ENDS = 0.1  # share of sequences that begin, and as many that end, without a key
 _SPEED = 1.5  # m/s, below which the hips travel where clips are spliced
 _HALVES, _POSITION_KEYS, _DRAWINGS = 0.1, 0.1, 0.1  # shares with keys of parts, of ground positions, and drawings
-
-# Validation.
-_VALIDATED_FRAMES = 192  # of the gap that is validated, 6.4 s; of shorter clips all but the ends
-_SHORTEST_VALIDATED = 90
-_VALIDATED_OF_KIND = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +103,7 @@ class KeySequences:
 
     motion: PartialMotion  # poses by frame; between keys of different clips they are anything finite
     given: GivenParts  # known parts of the frames that are keys
-    truthful: Bool[Tensor, "batch frames"]  # whether the poses between the keys are a performer's
+    truthful: Bool[Tensor, "batch frames"]  # whether poses are a performer's: those of keys, and between keys of a clip
     clip: Int[Tensor, "batch frames"]  # number of the clip that a frame is of
     mirrored: Bool[Tensor, " batch"]  # whether left and right are exchanged
 
@@ -159,13 +147,15 @@ class TweenerSettings(NetworkSettings):
         return TweenerTrainer(self, parts.train)
 
 
-class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
+class TweenerTrainer(InbetweenerTrainer[GeneratorNetwork]):
     """Draws sequences, hides all but their keys, and brings the generator nearer to what was between."""
+
+    gaps = (45, 90, 180)
 
     def __init__(self, settings: TweenerSettings, corpus: Corpus):
         self.path = ConvPathPredictor.load(settings.path).network.to(torch.get_default_device())
         self.path.reduced_precision = settings.bfloat16
-        self.windows = PoseWindows(corpus, evenness=1.0)
+        self.windows = PoseWindows(corpus)
         self.longest = min(settings.window, int(int(self.windows.lengths.max()) / (1 + _TEMPO)) - 1)
         self.config = settings.find_config()
         super().__init__(settings, lambda: GeneratorNetwork(self.config, bfloat16=settings.bfloat16))
@@ -180,34 +170,24 @@ class TweenerTrainer(GradientTrainer[GeneratorNetwork]):
     def losses(self) -> dict[str, Tensor]:
         batch, progress, generator = self.settings.batch, self.progress, self.generator
         shortest, reach = min(_SHORTEST_WINDOW, self.longest), round(1.25 * find_longest_gap(progress))
-        frames = self._draw_frames(shortest, min(self.longest, shortest + reach))
+        frames = draw_length(shortest, min(self.longest, shortest + reach), generator)
         count = max(1, round((1 - _SPLICED) * batch / frames))
         one = draw_windows(self.windows, count, frames, progress=progress, generator=generator)
-        frames = self._draw_frames(*_SPLICE)
+        frames = draw_length(*_SPLICE, generator)
         count = max(1, round(_SPLICED * batch / frames))
         other = draw_splices(self.windows, count, frames, progress=progress, generator=generator)
         parts, spliced = self._compare(one, 0.0), self._compare(other, _FOREIGN_STYLES)
         parts["loss"] = parts["loss"] + spliced["loss"]
         return parts | {f"spliced_{name}": spliced[name] for name in ("keys_cm", "root_cm", "style_cm", "dwell_cm")}
 
-    def _draw_frames(self, shortest: int, longest: int) -> int:
-        share = float(torch.rand((), generator=self.generator))
-        return round(shortest * (max(shortest, longest) / shortest) ** share)
-
     def _compare(self, sequences: KeySequences, foreign: float) -> dict[str, Tensor]:
         poses = draw_style_poses(self.windows, sequences, foreign, self.generator)
         styled = torch.rand(len(poses), generator=self.generator) < _STYLED
         return compute_tweener_losses(self.network, self.path, sequences, poses, styled)
 
-    def validate(self, corpus: Corpus) -> dict[str, Any]:
-        """Measure gaps of unseen clips (see `measure_kinds`)."""
-        return measure_kinds(self.network, corpus)
-
-    def score(self, row: Row) -> float:
-        """Return the error of unseen gaps over slerp's, geometric mean over kinds of clips."""
-        kinds = [name.removesuffix("_slerp_cm") for name, value in row.items() if name.endswith("_slerp_cm") and value]
-        pairs = [(row.get(f"{kind}_error_cm"), row[f"{kind}_slerp_cm"]) for kind in kinds]
-        return geometric_mean(error / slerp for error, slerp in pairs if error is not None)
+    def make_inbetweener(self, network: GeneratorNetwork) -> Tweener:
+        card = checkpoints.Card(self.settings.kind, {}, licence="")
+        return Tweener("in training", network, card, ConvPathPredictor.load(self.settings.path))
 
     def identify(self) -> Row:
         """Return the path predictor, which must not change between a run's parts."""
@@ -316,81 +296,32 @@ def draw_windows(
 def draw_splices(
     windows: PoseWindows, batch: int, frames: int, *, progress: float, generator: torch.Generator
 ) -> KeySequences:
-    """Draw keys of several clips: of one under 3 s, above that of another one the likelier the longer the gap is."""
+    """Draw keys each of which is of another clip, at distances that are proportional to the gaps, of 3 s at least."""
     rolls, longest = _roll(generator), find_longest_gap(progress)
     shape = (batch, frames)
     clip, time = (torch.zeros(shape, dtype=torch.long) for _ in range(2))
-    known, truthful = (torch.zeros(shape, dtype=torch.bool) for _ in range(2))
-    turn, shift = torch.zeros(shape), torch.zeros(*shape, 2)
+    known, turn, shift = torch.zeros(shape, dtype=torch.bool), torch.zeros(shape), torch.zeros(*shape, 2)
     for row in range(batch):
-        for part in _splice(windows, frames, longest, rolls, generator):
-            during, key = slice(part.start, None), slice(part.key, part.stop)
-            clip[row, during] = part.clip
-            time[row, during] = part.first + torch.arange(frames - part.start)
-            turn[row, during], shift[row, during] = part.turn, part.shift
-            known[row, key] = True
-            truthful[row, part.truthful_from : part.stop] = True
+        length, start, position = _draw_longest(longest, rolls), 0, torch.zeros(2)
+        while start < frames:
+            run = _draw_run(rolls)
+            number, first = (int(each) for each in windows.picker.pick(torch.tensor([run]), generator))
+            angle, at = torch.tensor(2 * math.pi * next(rolls)), int(windows.starts[number]) + first
+            begun, ended = rotations.rotate_ground(windows.ground[[at, at + run - 1]], angle.expand(2))
+            # The excerpt goes on until the next key, as nothing that counts.
+            clip[row, start:], time[row, start:] = number, first + torch.arange(frames - start)
+            turn[row, start:], shift[row, start:] = angle, position - begun
+            known[row, start : start + run] = True
+            gap = _draw_gap(length, rolls)
+            gap = gap if gap >= _SPLICED_FROM else gap + _SPLICED_FROM
+            travelled, towards = gap / PRIOR_FPS * _SPEED * next(rolls), 2 * math.pi * next(rolls)
+            position = position + ended - begun
+            position = position + travelled * torch.tensor([math.sin(towards), math.cos(towards)])
+            start += run - 1 + gap
     motion = windows.gather(clip, time.double())
     root = rotations.rotate_about_y(motion.root_position, turn) + rotations.lift_ground(shift)
     motion = replace(motion, root_position=root, heading=motion.heading + turn)
-    return _finish(motion, known, truthful, clip, rolls, generator)
-
-
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """A key, and the excerpt of a clip that it belongs to and that goes on until another part begins."""
-
-    clip: int
-    start: int  # frame of the sequence at which the excerpt begins
-    first: int  # and the clip's frame there
-    key: int  # frame of the sequence at which the key begins
-    stop: int  # and one past its end
-    truthful_from: int  # since when the sequence is the clip
-    turn: float  # of the excerpt about +Y, radians
-    shift: Float[Tensor, " 2"]  # and over the ground, metres, behind the turn
-
-    def time_at(self, frame: int) -> int:
-        return self.first + frame - self.start
-
-
-def _splice(
-    windows: PoseWindows, frames: int, longest: float, rolls: Iterator[float], generator: torch.Generator
-) -> Iterator[_Part]:
-    """Yield the keys of a sequence in temporal order."""
-    length = _draw_longest(longest, rolls)
-    part = _begin(windows, rolls, generator)
-    while part.key < frames:
-        yield part
-        gap = _draw_gap(length, rolls)
-        last = part.stop - 1
-        room = int(windows.lengths[part.clip]) - 1 - part.time_at(last)
-        other = next(rolls) < gap / _LONGEST_GAP if gap >= _SPLICED_FROM else gap > room
-        if other or gap > room:
-            gap = gap if gap >= _SPLICED_FROM else gap + _SPLICED_FROM
-            part = _leave(windows, part, gap, rolls, generator)
-        else:
-            stop = last + gap + min(_draw_run(rolls), room - gap + 1)
-            part = replace(part, key=last + gap, stop=stop, truthful_from=last)
-
-
-def _begin(windows: PoseWindows, rolls: Iterator[float], generator: torch.Generator) -> _Part:
-    run = _draw_run(rolls)
-    clip, first = (int(each) for each in windows.picker.pick(torch.tensor([run]), generator))
-    turn = 2 * math.pi * next(rolls)
-    shift = -rotations.rotate_ground(windows.ground[windows.starts[clip] + first], torch.tensor(turn))
-    return _Part(clip, 0, first, 0, run, 0, turn, shift)
-
-
-def _leave(windows: PoseWindows, part: _Part, gap: int, rolls: Iterator[float], generator: torch.Generator) -> _Part:
-    """Go on with another clip after so many frames, at a distance that is proportional to them."""
-    new, last = _begin(windows, rolls, generator), part.stop - 1
-    before = windows.starts[part.clip] + part.time_at(last)
-    position = rotations.rotate_ground(windows.ground[before], torch.tensor(part.turn)) + part.shift
-    travelled = gap / 30 * _SPEED * next(rolls)
-    towards = 2 * math.pi * next(rolls)
-    shift = new.shift + position + travelled * torch.tensor([math.sin(towards), math.cos(towards)])
-    start = last + gap
-    return replace(new, start=start, key=start, stop=start + new.stop, truthful_from=start, shift=shift)
+    return _finish(motion, known, known, clip, rolls, generator)
 
 
 def _lay_keys(frames: int, longest: float, rolls: Iterator[float]) -> Iterator[tuple[int, int]]:
@@ -593,64 +524,13 @@ def draw_style_poses(
     return kinematics.positions_from_matrices(CANONICAL, local)
 
 
-@torch.no_grad()
-def measure_kinds(network: GeneratorNetwork, corpus: Corpus) -> dict[str, Any]:
-    """Measure gaps by kind of clips: error beside slerp's, cm, and speed, spread and jerk over mocap's, of sums."""
-    windows = PoseWindows(corpus, evenness=1.0)
-    kind_of = [find_kind(name) for name in corpus.names]
-    row: dict[str, Any] = {}
-    for kind, name in enumerate([*KINDS, "other"]):
-        found = [number for number, each in enumerate(kind_of) if each == kind]
-        found = [one for one in found if int(windows.lengths[one]) >= _SHORTEST_VALIDATED + 2]
-        if found:
-            row |= {f"{name}_{what}": value for what, value in _measure_clips(network, windows, found).items()}
-    return row
-
-
-def _measure_clips(network: GeneratorNetwork, windows: PoseWindows, clips: Sequence[int]) -> dict[str, float]:
-    sums = {"generated": NOTHING, "slerp": NOTHING, "true": NOTHING}
-    for number in clips[:_VALIDATED_OF_KIND]:
-        frames = min(_VALIDATED_FRAMES + 2, int(windows.lengths[number]))
-        motion = windows.at(torch.tensor([number]), torch.zeros(1, dtype=torch.long), frames, torch.ones(1))
-        for name, found in measure_gap(network, motion).items():
-            sums[name] += found
-    generated, slerp, true = (sums[name] for name in ("generated", "slerp", "true"))
-    return {
-        "error_cm": generated.error / generated.count,
-        "slerp_cm": slerp.error / slerp.count,
-        "speed": generated.speed / true.speed,
-        "spread": generated.spread / true.spread,
-        "jerk": generated.jerk / true.jerk,
-    }
-
-
-@torch.no_grad()
-def measure_gap(network: GeneratorNetwork, motion: PartialMotion) -> dict[str, Liveliness]:
-    """Measure the motion generated between the first and the last pose of one motion, beside slerp and the truth."""
-    known = torch.zeros(motion.heading.shape, dtype=torch.bool)
-    known[:, [0, -1]] = True
-    image = make_key_image(motion, GivenParts.whole(known))
-    generated = network(image, torch.zeros(1, network.config.style)).turn_to_world(image)
-    local = motion.local_matrices()
-    true = see_from_hips(kinematics.positions_from_matrices(CANONICAL, local), local[..., 0, :, :])[0]
-    shown = replace(motion, known=KnownParts.whole(known))
-    guess = interpolate_partial_motion(shown, motion.quats[0, 0], 0.0).local_matrices()
-    slerp = see_from_hips(kinematics.positions_from_matrices(CANONICAL, guess), guess[..., 0, :, :])[0]
-    mine = see_from_hips(generated.positions, generated.local_matrix[..., 0, :, :])[0]
-    inside = ~known[0]
-    return {
-        name: measure_liveliness(seen, true, inside)
-        for name, seen in (("generated", mine), ("slerp", slerp), ("true", true))
-    }
-
-
 CLIPS_OF_CLASS = 24
 """Clips of a class that its vector is the mean of, at most: evenly among all of them by name."""
 
 
-def collect_dna(corpus: Corpus, labels: str = LABELS) -> Mapping[str, Sequence[MotionDna]]:
+def collect_dna(corpus: Corpus, labels: str = LABELS) -> Mapping[str, Sequence[Float[Tensor, "poses joints 3"]]]:
     """Collect the poses of clips by class; RequestError for labels of one's own that no clip has."""
-    clips, found = corpus.clips(), dict[str, list[MotionDna]]()
+    clips, found = corpus.clips(), dict[str, list[Tensor]]()
     for name, numbers in group_clips(corpus.names, labels).items():
         taken = min(len(numbers), CLIPS_OF_CLASS)
         poses = [BodyPose.of_features_in_place(clips[numbers[at * len(numbers) // taken]]) for at in range(taken)]
