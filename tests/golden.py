@@ -3,8 +3,7 @@
 `python tests/golden.py` compares this checkout's outputs with tests/golden.json; with `--write` it writes that file
 anew, which a commit that means to change what the program does explains. Bits hold on the kind of machine that wrote
 the file (processor and libraries, see `kind_of_machine`); elsewhere the numbers in each file are compared, within a
-tolerance. `python tests/golden.py FILE...` does the same with the bundled weights, once without a clip and on
-110 frames of each file, against tests/golden-bundled.json.
+tolerance.
 """
 
 import contextlib
@@ -28,7 +27,6 @@ from tiny_infiller import save_tiny_infiller
 from tiny_prior import save_tiny_prior
 
 FILE = Path(__file__).with_name("golden.json")
-BUNDLED = Path(__file__).with_name("golden-bundled.json")
 _NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?(?![\w.])")
 _TIMED = {"timing", "seconds", "frame_ms", "versions"}
 _SHOWN = 6  # numbers of each file that are kept
@@ -104,29 +102,6 @@ COMMANDS = {
     "train infiller, image": "train infiller --data data -o image --steps 1 --batch 2 --window 32 --architecture image",
 }
 """By name, a command line that is run in the folder `prepare` makes, one after the other."""
-
-WITHOUT_A_CLIP = {
-    "follow": "follow circle:2 -o follow.bvh --seconds 4",
-    "follow, free": "follow wave:0.5x2 -o free.bvh --seconds 3 --weights free --speed 0:1,2:1.6",
-    "a shot": "follow line:3 -o shot.bvh --start stand --end stand",
-    "generate": "generate -o drawn --seconds 3 --count 2 --seed 4",
-    "generate, free": "generate -o drawn-free --seconds 2 --weights free",
-    "steer": "steer steering.csv -o steered.bvh",
-}
-ON_A_CLIP = {
-    "cut": "convert {clip} clip.bvh --frames 15:125",
-    "canonical": "convert clip.bvh canonical.npz --rig canonical",
-    "preset": "convert clip.bvh preset.glb --rig ue5",
-    "denoise": "denoise noisy.bvh -o denoised.bvh --report denoised.json",
-    "denoise, free": "denoise noisy.bvh -o denoised-free.bvh --weights free",
-    "denoise causal": "denoise noisy.bvh -o causal.bvh --causal",
-    "infill": "infill clip.bvh -o filled.bvh --gap 30:70 --report filled.json",
-    "infill joints": "infill clip.bvh -o arm.bvh --gap 30:60 --joints leftLowerArm,leftHand --weights free",
-    "tween": "tween clip.bvh -o tweened.bvh --keyframes 0,20,60,100",
-    "generate on": "generate -o on --seconds 1 --start clip.bvh",
-    "measure": "measure denoised.bvh --reference clip.bvh --json",
-}
-"""Those with the bundled weights: once, and in a folder a clip."""
 
 
 def prepare(folder: Path) -> None:
@@ -257,40 +232,14 @@ def _near(ours: dict, theirs: dict) -> bool:
     )
 
 
-def run_all(commands: dict[str, str], golden: dict, *, to_the_bit: bool, prefix: str = "") -> tuple[dict, int]:
+def run_all(commands: dict[str, str], golden: dict, *, to_the_bit: bool) -> tuple[dict, int]:
     """Run commands in the working directory; return their fingerprints and the number of faults, which it prints."""
     all_found, bad = {}, 0
     for name, line in commands.items():
-        found = all_found[prefix + name] = run_command(line)
-        faults = differences(found, golden.get(prefix + name, {}), to_the_bit=to_the_bit)
+        found = all_found[name] = run_command(line)
+        faults = differences(found, golden.get(name, {}), to_the_bit=to_the_bit)
         bad += len(faults)
-        print(
-            f"{prefix}{name}: {len(found)} files, {'; '.join(faults) if faults else 'as they were'}"[:300], flush=True
-        )
-    return all_found, bad
-
-
-def run_bundled(clips: list[Path], golden: dict, *, to_the_bit: bool) -> tuple[dict, int]:
-    """Run the commands that have bundled weights, once and on each clip."""
-    from corruptions import add_noise
-
-    import mapctl
-
-    Path("steering.csv").write_text(STEERING)
-    all_found, bad = run_all(WITHOUT_A_CLIP, golden, to_the_bit=to_the_bit)
-    for clip in clips:
-        folder = Path(clip.stem)
-        folder.mkdir()
-        with contextlib.chdir(folder):
-            cut = {"cut": ON_A_CLIP["cut"].format(clip=clip)}
-            first = run_all(cut, golden, to_the_bit=to_the_bit, prefix=f"{clip.stem}: ")
-            noise = torch.Generator().manual_seed(5)
-            add_noise(mapctl.load("clip.bvh"), noise, degrees=4, centimetres=1).save("noisy.bvh")
-            others = {name: line for name, line in ON_A_CLIP.items() if name != "cut"}
-            later = run_all(others, golden, to_the_bit=to_the_bit, prefix=f"{clip.stem}: ")
-        for found, faults in (first, later):
-            all_found |= found
-            bad += faults
+        print(f"{name}: {len(found)} files, {'; '.join(faults) if faults else 'as they were'}"[:300], flush=True)
     return all_found, bad
 
 
@@ -298,18 +247,13 @@ def main() -> None:
     """Compare, or write."""
     os.environ["NO_COLOR"] = "1"
     torch.set_num_threads(1)
-    clips = [Path(name).absolute() for name in sys.argv[1:] if not name.startswith("--")]
-    file = BUNDLED if clips else FILE
-    golden = json.loads(file.read_text()) if file.exists() else {"machine": "", "outputs": {}}
+    golden = json.loads(FILE.read_text()) if FILE.exists() else {"machine": "", "outputs": {}}
     to_the_bit = golden["machine"] == kind_of_machine()
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
-        if clips:
-            all_found, bad = run_bundled(clips, golden["outputs"], to_the_bit=to_the_bit)
-        else:
-            prepare(Path())
-            all_found, bad = run_all(COMMANDS, golden["outputs"], to_the_bit=to_the_bit)
+        prepare(Path())
+        all_found, bad = run_all(COMMANDS, golden["outputs"], to_the_bit=to_the_bit)
     if "--write" in sys.argv:
-        file.write_text(json.dumps({"machine": kind_of_machine(), "outputs": all_found}, indent=1) + "\n")
+        FILE.write_text(json.dumps({"machine": kind_of_machine(), "outputs": all_found}, indent=1) + "\n")
     else:
         sys.exit(bool(bad))
 

@@ -142,10 +142,10 @@ def _denoise_file(command: Denoise, rig: Rig | None, progress: Progress | None =
 def _load(load: Callable[[str], T], name: str) -> T:
     """Load a network, once a process; its licence is noted each time."""
     checkpoints.note_use(name)
-    return _load_once(load, name)
+    return _load_once(load, name, checkpoints.locate(name).resolve())
 
 
-_load_once = cache(lambda load, name: load(name))
+_load_once = cache(lambda load, name, _path: load(name))
 
 
 def _format_certainty(done: DenoiseSolution) -> list[str]:
