@@ -7,6 +7,7 @@ motion, and any number of samples.
 """
 
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 
@@ -36,4 +37,4 @@ film(shots, "five-variations-side-by-side.webp", camera=camera, size=(480, 200),
 # The same in stills: all begin and end alike, to the bit.
 
 stills = [(name, each.slice(21, 61)) for name, each in variations.items()]
-draw_strips_to(stills, "five-variations-in-stills.png", size=(900, 500))
+draw_strips_to(stills, Path("five-variations-in-stills.png"))
