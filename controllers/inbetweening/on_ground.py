@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from controllers.shots.uneven import Footing, Sole, SteppedMotion, find_feet, find_slope, fit_planes, step_onto_ground
+from controllers.shots.uneven import Footing, Sole, SteppedMotion, find_slope, fit_planes, step_onto_ground
 from mapctl import rotations
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
@@ -23,7 +23,7 @@ from mapctl.numerics.smooth_offsets import interpolate_offsets, interpolate_turn
 from mapctl.recording.fusion import transfer_change
 from mapctl.retarget import RigMap, as_rig, from_canonical, to_canonical
 from mapctl.retarget.character import TOES, Stance, rotate_foot_frames
-from mapctl.retarget.legs import bend_legs, find_ankles, lower_by
+from mapctl.retarget.legs import bend_legs, find_ankles, locate_feet, lower_by
 
 _FADE_SECONDS = 0.3  # over which a correction at a key fades
 
@@ -81,7 +81,7 @@ class KeysOnGround:
 def _bring_to_floor(poses: Motion, ground: Ground, stance: Stance) -> Motion:
     """Bring canonical poses on a ground onto the flat floor: feet as high over it and as level as over what they stand
     on, hips lower by the mean of both."""
-    (toes, feet), lower = find_feet(poses), torch.zeros(poses.num_frames, 2, dtype=torch.float64)
+    (toes, feet), lower = locate_feet(poses), torch.zeros(poses.num_frames, 2, dtype=torch.float64)
     for foot in range(2):
         sole = Sole.of(poses, float(stance.standing_height[foot]), foot)
         for frame, facing in enumerate(rotations.split_heading(feet[:, foot])[0]):
@@ -106,7 +106,7 @@ def _meet_keys(stepped: SteppedMotion, motion: Motion, keyed: Motion, keys: Int[
         firm = at_keys[:, None].expand(found.shape[:2])
         return interpolate_turns(found, wanted, firm, seconds=_FADE_SECONDS, fps=fps)
 
-    (toes, feet), (wanted, wanted_feet) = find_feet(motion), find_feet(keyed)
+    (toes, feet), (wanted, wanted_feet) = locate_feet(motion), locate_feet(keyed)
     off, firm = (wanted - toes) * at_keys[:, None, None], at_keys[:, None].repeat(1, 2)
     for hold in stepped.holds:
         start, stop = (round(frame * fps / PRIOR_FPS) for frame in (hold.start, hold.stop))

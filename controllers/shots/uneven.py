@@ -28,7 +28,7 @@ from mapctl.numerics.easing import smootherstep
 from mapctl.numerics.intervals import true_intervals
 from mapctl.numerics.smooth_offsets import smooth_between
 from mapctl.retarget.character import LEGS, limb_extension
-from mapctl.retarget.legs import bend_legs, find_ankles, lower_hips
+from mapctl.retarget.legs import bend_legs, find_ankles, locate_feet, lower_hips
 from mapctl.skeleton import CANONICAL, FEET, TOES, find_heels
 
 STEEPEST = math.radians(15.0)
@@ -165,12 +165,6 @@ class Footing:
         return tuple(found)
 
 
-def find_feet(motion: Motion) -> tuple[Float[Tensor, "frames 2 3"], Float[Tensor, "frames 2 4"]]:
-    """Return the toe joints of a canonical motion, world, metres, and the rotations of its feet."""
-    toes, feet = (list(CANONICAL.indices(names)) for names in (TOES, FEET))
-    return motion.joint_positions()[:, toes].double(), motion.joint_rotations()[:, feet].double()
-
-
 def find_slope(gradient: Float[Tensor, "2"]) -> Float[Tensor, "4"]:
     """Return the rotation from the floor to a plane that rises so along x and along z."""
     x, z = gradient
@@ -206,7 +200,7 @@ class SteppedMotion:
 
     def lift_swings(self, keys: Sequence[int]) -> "SteppedMotion":
         """Lift swing feet again where they come too near to the ground, but in the frames of `keys`."""
-        (toes, feet), (_, flat_feet) = find_feet(self.motion), find_feet(self.flat)
+        (toes, feet), (_, flat_feet) = locate_feet(self.motion), locate_feet(self.flat)
         for foot, (track, sole) in enumerate(zip(self.tracks, self.soles, strict=True)):
             own, flat = feet[:, foot], flat_feet[:, foot]
             toes[:, foot] = track.lift(toes[:, foot], own, flat, self.ground, sole, keys)
@@ -215,7 +209,7 @@ class SteppedMotion:
 
     def measure_footing(self) -> Footing:
         """Measure how feet stand and swing."""
-        (toes, turns), (flat, flat_turns) = find_feet(self.motion), find_feet(self.flat)
+        (toes, turns), (flat, flat_turns) = locate_feet(self.motion), locate_feet(self.flat)
         clearance, depth, level = math.inf, 0.0, torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
         speeds = list[Tensor]()
         for foot, (sole, track) in enumerate(zip(self.soles, self.tracks, strict=True)):
@@ -251,7 +245,7 @@ def step_onto_ground(motion: Motion, ground: Ground, rest_height: float, *, keys
     the ground. Footholds in the frames of `keys` stay."""
     soles = [Sole.of(motion, rest_height, foot) for foot in range(2)]
     holds = _choose_footholds(_find_footholds(motion), motion, ground, soles, keys)
-    flat, flat_turns = find_feet(motion)
+    flat, flat_turns = locate_feet(motion)
     toes, turns, tracks = [], [], list[_FootTrack]()
     for foot, sole in enumerate(soles):
         own, turn = [hold for hold in holds if hold.foot == foot], flat_turns[:, foot]

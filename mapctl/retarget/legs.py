@@ -11,7 +11,7 @@ from mapctl.kinematics import inverse
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
 from mapctl.numerics.easing import smootherstep
-from mapctl.retarget.character import HIP_JOINTS, LEGS, TOES, limb_lengths
+from mapctl.retarget.character import FEET, HIP_JOINTS, LEGS, TOES, limb_lengths
 from mapctl.skeleton import Skeleton
 
 FREE_EXTENSION = 0.985  # of the leg: a leg may be that straight, whatever the source's is
@@ -23,7 +23,11 @@ _STRAIGHT_SHARES = (0.93, 0.985)
 # Of the leg's length, how far down a foot is from which the hips' height begins to matter to it, and matters fully.
 _DOWN_SHARES = (0.5, 0.8)
 _LEAST_INFLUENCE = 0.02  # of both legs together, below which the hips' height is left to the trajectory
-_UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+
+
+def locate_feet(motion: Motion) -> tuple[Float[Tensor, "frames 2 3"], Float[Tensor, "frames 2 4"]]:
+    """Return the toe joints, world, metres, and the rotations of the feet."""
+    return motion.joint_positions()[:, TOES].double(), motion.joint_rotations()[:, FEET].double()
 
 
 def find_ankles(
@@ -62,7 +66,7 @@ def fit_hips(moved: Motion, ankles: Float[Tensor, "frames 2 3"], stretch: Float[
     total = influence.sum(dim=-1, keepdim=True)
     lower = (influence * short).sum(dim=-1, keepdim=True) / (total + _LEAST_INFLUENCE)
     dip = gaussian.smooth(lower, _HIP_FIT_SECONDS * float(moved.fps))
-    return replace(moved, root_position=moved.root_position - dip * _UP)
+    return lower_by(moved, dip[:, 0])
 
 
 def lower_hips(moved: Motion, ankles: Float[Tensor, "frames 2 3"], stretch: Float[Tensor, "frames 2"]) -> Motion:
@@ -71,7 +75,7 @@ def lower_hips(moved: Motion, ankles: Float[Tensor, "frames 2 3"], stretch: Floa
     # A leg that points sideways or up is not helped by lower hips.
     short = torch.where(down > _DOWN_SHARES[0], short.clamp_min(0), 0.0).amax(dim=-1, keepdim=True)
     dip = gaussian.envelope(short, _HIP_DROP_SECONDS, float(moved.fps))
-    return replace(moved, root_position=moved.root_position - dip * _UP)
+    return lower_by(moved, dip[:, 0])
 
 
 def bend_legs(motion: Motion, ankles: Float[Tensor, "frames 2 3"], turns: Float[Tensor, "frames 2 4"]) -> Motion:
