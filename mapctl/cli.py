@@ -10,7 +10,9 @@ import os
 import re
 import signal
 import sys
+import threading
 import time
+import traceback
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stderr
 from dataclasses import make_dataclass
@@ -138,9 +140,11 @@ def _raise_on_signals() -> list[int]:
     received: list[int] = []
     until = 0.0
 
-    def stop(number: int, _: FrameType | None) -> None:
+    def stop(number: int, frame: FrameType | None) -> None:
         nonlocal until
-        if time.monotonic() >= until:
+        if _is_compiling(frame):  # LLVM calls Python back, drops what is raised there, and crashes
+            threading.Timer(0.05, signal.raise_signal, (number,)).start()
+        elif time.monotonic() >= until:
             until = time.monotonic() + 1.0
             received.append(number)
             raise KeyboardInterrupt
@@ -150,6 +154,10 @@ def _raise_on_signals() -> list[int]:
         if number is not None and signal.getsignal(number) not in (signal.SIG_IGN, None):
             signal.signal(number, stop)
     return received
+
+
+def _is_compiling(frame: FrameType | None) -> bool:
+    return any(each.f_globals.get("__name__", "").startswith("llvmlite.") for each, _ in traceback.walk_stack(frame))
 
 
 def _print_error(message: str, status: int) -> int:

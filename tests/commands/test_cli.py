@@ -220,6 +220,31 @@ def test_interruption_leaves_nothing_half_done(prior, tmp_path, number, said):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_ctrl_c_waits_for_the_compiler():
+    """LLVM calls back while numba compiles: an exception there is lost, and what the callback did not do crashes."""
+    script = """
+import ctypes, signal, sys, time
+from llvmlite.binding import executionengine
+from numba import njit
+from mapctl import cli
+
+def interrupt(*given):
+    signal.raise_signal(signal.SIGINT)
+    return ctypes.string_at(*given)
+
+class Compiling:
+    def run(self):
+        njit(lambda x: x + 1)(1)
+        time.sleep(10)
+
+executionengine.string_at = interrupt  # of the callback that gets the compiled code
+cli.parse = lambda words: Compiling()
+sys.exit(cli.main())
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (130, "mapctl: interrupted\n")
+
+
 @pytest.mark.slow
 def test_a_walk_interrupted_from_outside_leaves_a_whole_file_or_none(prior, tmp_path):
     words = ("follow", "circle:4", "-o", tmp_path / "walk.bvh", "--seconds", 3000, "--prior", prior)
