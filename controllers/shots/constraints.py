@@ -73,8 +73,10 @@ class Constraint:
         return {"constraint": self.name, **{name: getattr(self, name) for name in names}}
 
 
-def check_keys(request: ShotRequest, motion: Motion, met: Sequence[MetPose] = ()) -> tuple[Constraint, ...]:
-    """Measure what is reached for and looked at on a motion at PRIOR_FPS; poses as they were met."""
+def check_keys(
+    request: ShotRequest, motion: Motion, met: Sequence[MetPose], flat: Motion
+) -> tuple[Constraint, ...]:
+    """Measure what is reached for and looked at on a motion at PRIOR_FPS; poses as they were met over a flat floor."""
     found, positions = list[Constraint](), motion.joint_positions()
     for reach in request.reaches:
         targets = ReachTargets.of((reach,), motion.num_frames).targets
@@ -83,7 +85,7 @@ def check_keys(request: ShotRequest, motion: Motion, met: Sequence[MetPose] = ()
         limit = max(_REACH_CM, 100 * max(map(reach.tolerance_of, reach.positions)))
         remedy = _find_remedy(reach, motion) if miss > limit else ""
         found.append(Constraint(name, _held(reach), miss, limit, "cm", remedy=remedy, seconds=_span(reach)))
-    found += [_check_pose(one, motion) for one in met]
+    found += [_check_pose(one, flat) for one in met]
     for look in request.looks:
         worst = float(measure_look_errors(motion, look).max())
         name = f"look at {round(look.seconds, 2):g} s"

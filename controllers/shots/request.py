@@ -199,7 +199,7 @@ class PoseKey:
     place: tuple[float, float] | None = None
     """Hips over the ground, x and z, metres; on the trajectory if not given."""
     height: float | None = None
-    """Height of the hips, metres; the pose's if not given."""
+    """Height of the hips over the ground, metres; the pose's if not given."""
     facing_deg: float | None = None
     """Heading of the hips, degrees from +Z toward +X; that of a pose is along the trajectory if not given."""
     joints: tuple[str, ...] = ()
@@ -325,11 +325,9 @@ class ShotRequest:
             "a loop needs a closed curve, and this one is open": self.loop and not self.curve.closed,
             "a loop is walked once around, in its stride: without start, end, seconds, speeds by time": self.loop
             and (ends or self.seconds is not None or timed),
-            "on a ground a shot has a curve of x,z, standing ends, obstacles, reaches and looks: no poses, clips,"
-            " footsteps or loop": (
+            "on a ground a shot has a curve of x,z, and neither continues from a clip, ends in one, nor loops": (
                 self.ground is not None
-                and bool(self.poses or self.footsteps or self.loop)
-                | (self.lead is not None or self.arrival is not None or self.curve.dims == 3)
+                and (self.lead is not None or self.arrival is not None or self.loop or self.curve.dims == 3)
             ),
         }
         if fault := next((what for what, holds in faults.items() if holds), None):

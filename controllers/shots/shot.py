@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import reduce
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controllers.common.character import Character
@@ -108,10 +108,10 @@ def solve_shot(
         planned = replace(request, speed=speed)
     trajectory = plan_trajectory(planned)
     rest = build_rest_pose(prior, skeleton, character.toe_rest_height)
-    limb_keys = as_reaches(request.poses, trajectory, rest)
-    poses = tuple(key for key in request.poses if not key.joints)
-    request = replace(request, reaches=(*request.reaches, *limb_keys), poses=poses)
     level = request if request.ground is None else request.lower_targets(_find_rise(request.ground, trajectory))
+    poses = tuple(key for key in request.poses if not key.joints)
+    level = replace(level, reaches=(*level.reaches, *as_reaches(request.poses, trajectory, rest)), poses=poses)
+    request = level if request.ground is None else level.lower_targets(-_find_rise(request.ground, trajectory))
     check_reaches(level.reaches, trajectory, rest)
     trajectory = bend_toward_keys(trajectory, level, rest)
     if slows_in_corners(request, trajectory.curve):
@@ -137,13 +137,15 @@ def solve_shot(
     if inbetweener is not None:
         joined = join_pieces(pieces, trajectory, inbetweener, request.footsteps)
         flat = _finish_ends(joined, request, trajectory, inbetweener)
-    motion = flat
+        flat, met = meet_poses(flat, request.poses, trajectory, inbetweener)
+    motion, posed = flat, pose_frames(met, flat.num_frames)
     if request.ground is not None:
-        stepped = step_onto_ground(flat, request.ground, character.toe_rest_height)
+        fixed = [*posed.nonzero()[:, 0].tolist(), *(step.land for step in request.footsteps)]
+        stepped = step_onto_ground(flat, request.ground, character.toe_rest_height, keys=fixed)
         motion = stepped.motion
     if inbetweener is not None:  # which knows motion over a floor alone
         rise = (motion.root_position - flat.root_position)[:, 1]
-        level, settled, met = _meet_keys(lower_by(motion, rise), request.lower_targets(rise), trajectory, inbetweener)
+        level, settled = _meet_targets(lower_by(motion, rise), request.lower_targets(rise), posed, inbetweener)
         motion = lower_by(level, -rise)
         reaches = tuple(replace(key, seconds=one.seconds) for key, one in zip(request.reaches, settled, strict=True))
     flat = motion if stepped is None else flat
@@ -154,7 +156,7 @@ def solve_shot(
         notes += check_tracking(flat, trajectory.curve)
     trajectory = trajectory.slice(motion.num_frames)
     found = replace(request, reaches=reaches)
-    constraints = (*check_walk(found, trajectory, flat), *check_keys(found, motion, met))
+    constraints = (*check_walk(found, trajectory, flat), *check_keys(found, motion, met, flat))
     notes += describe_conflicts(constraints, trajectory, motion)
     footing, footsteps = None, find_footsteps(flat)
     if stepped is not None:
@@ -197,20 +199,19 @@ def _finish_ends(
     return motion
 
 
-def _meet_keys(
-    motion: Motion, request: ShotRequest, trajectory: Trajectory, inbetweener: Inbetweener
-) -> tuple[Motion, tuple[Reach, ...], tuple[MetPose, ...]]:
-    """Let a walked motion meet poses, then reaches, then looks; also return reaches and poses as they were met."""
-    motion, met = meet_poses(motion, request.poses, trajectory, inbetweener)
+def _meet_targets(
+    motion: Motion, request: ShotRequest, posed: Bool[Tensor, " frames"], inbetweener: Inbetweener
+) -> tuple[Motion, tuple[Reach, ...]]:
+    """Let a motion, some of whose frames are posed, meet reaches, then looks; also return the reaches as they were
+    met."""
     reaches = settle_reaches(request.reaches, motion)
-    posed = pose_frames(met, len(trajectory.speeds))
     motion = go_down(motion, reaches, posed)
     if reaches:
-        reach = ReachTargets.of(reaches, len(trajectory.speeds)).relaxed(motion).within_reach(motion)
+        reach = ReachTargets.of(reaches, len(posed)).relaxed(motion).within_reach(motion)
         free = reach.free_limbs(motion.num_joints, posed)
         motion = fill(motion, free, inbetweener, targets=reach.led_there(motion).targets).motion
     motion = look_where_hands_reach(motion, reaches, request.looks, posed)
-    return turn_heads(motion, request.looks), reaches, met
+    return turn_heads(motion, request.looks), reaches
 
 
 def follow(

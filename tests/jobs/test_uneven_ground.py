@@ -170,9 +170,28 @@ def test_hands_reach_over_the_ground(path):
     assert done.footing.penetration < 0.01
 
 
-def test_poses_on_a_ground_are_refused(path):
-    with pytest.raises(RequestError, match="no poses"):
-        ShotRequest(curves.line(length=3), poses=(PoseKey(1.0, facing_deg=20.0),), ground=Ground.read(path))
+def test_poses_and_footsteps_are_met_on_the_ground(walked, path):
+    """A body that bows on the kerb, and a foothold that is moved there."""
+    step = next(step for step in walked.footsteps if 1.9 < step.toe[1] < 2.4)
+    step = replace(step, toe=(step.toe[0] + 0.08, step.toe[1]))
+    ground, at = Ground.read(path), (step.land + 30) / 30
+    key = PoseKey(at, height=0.80, tolerance=0.01)
+    request = ShotRequest(curves.line(length=5), poses=(key,), footsteps=(step,), ground=ground)
+    transformer = priors.load_inbetweener("transformer")
+    done = solve_shot(priors.load("locomotion"), transformer, request, generator=generator(0))
+    toe = done.motion.joint_positions()[step.land, CANONICAL.index(TOES[step.foot])].double()
+    assert float((toe[::2] - toe.new_tensor(step.toe)).norm()) < 0.05
+    assert float(toe[1]) - float(ground.height(toe[::2])) == pytest.approx(TOE_REST_HEIGHT, abs=0.02)
+    hips = done.motion.root_position[round(at * 30)].double()
+    assert float(hips[1] - ground.height(hips[::2])) == pytest.approx(0.80, abs=0.15)
+    assert all(one.holds for one in done.constraints if "at" in one.name), done.constraints
+    assert done.footing is not None
+    assert done.footing.penetration < 0.01
+
+
+def test_clips_and_loops_on_a_ground_are_refused(path):
+    with pytest.raises(RequestError, match="nor loops"):
+        ShotRequest(curves.circle(radius=3), loop=True, ground=Ground.read(path))
 
 
 def measure_depth(motion, ground):
