@@ -236,7 +236,7 @@ def fill(
         rig=as_rig(clip.rigmap),
         contacts=contacts.debounced(answer.contact_logits > 0),
         sources=answer.attribute(query),
-        gap_notes=_note_gaps(query, answer, fps=float(motion.fps)),
+        gap_notes=_note_gaps(query, answer, clip),
     )
 
 
@@ -273,22 +273,19 @@ class CanonicalClip:
     ) -> GapQuery:
         """Build the query for in-betweeners, at PRIOR_FPS; targets and loose keys are by frame of the clip.
 
-        A frame of the query between two of the clip is the nearby frame with the fewest missing values, if that has
-        fewer than the two.
+        In a frame of the query is missing what is in either of the two of the clip about it, but no more than in the
+        most complete one nearby: less than 1/60 s from a known value, its interpolation is as good as known.
         """
         canonical, missing = self.canonical, self.missing
-        whole = _resample_to_end(canonical)
-        at = torch.arange(whole.num_frames, dtype=torch.float64) * float(canonical.fps) / PRIOR_FPS
+        shown = _resample_to_end(canonical)
+        at = torch.arange(shown.num_frames, dtype=torch.float64) * float(canonical.fps) / PRIOR_FPS
         at = at.clamp(max=canonical.num_frames - 1)
         low = (at + 1e-9).floor().long()
         high = torch.where(at - low > _TIE_FRAMES, low + 1, low).clamp(max=canonical.num_frames - 1)
         missing_values = torch.cat([missing.joints, missing.root[:, None]], dim=1)
         best = _find_most_complete_frames(at, missing_values.sum(dim=1))
         snapped = missing_values[best].sum(dim=1) < (missing_values[low] | missing_values[high]).sum(dim=1)
-        at = torch.where(snapped, best.to(at), at)
         low, high = torch.where(snapped, best, low), torch.where(snapped, best, high)
-        shown = restore_observed(canonical.pick(best), whole, MissingMask.of_frames(snapped, canonical.num_joints))
-        shown = replace(shown, local_quat_xyzw=rotations.make_sign_continuous(shown.local_quat_xyzw))
         joints, fps = self._missing_canonical_joints(), float(canonical.fps)
         seconds, mask = at / fps, MissingMask(joints[low] | joints[high], missing.root[low] | missing.root[high])
         targets = effector_targets and effector_targets.shown(seconds, fps=fps)
@@ -459,10 +456,11 @@ def _reach_targets(
     return done, (f"frame {worst}: a limb stays {100 * float(errors.max()):.1f} cm from its target, out of reach",)
 
 
-def _note_gaps(query: GapQuery, answer: Proposal, *, fps: float) -> tuple[str, ...]:
-    """Note each gap of a proposal, in frames of the motion at `fps`: proposer, error estimate (of the gap with the
-    largest) and remarks. Gaps without remarks share one note by proposer."""
-    last = len(query.seconds) - 1
+def _note_gaps(query: GapQuery, answer: Proposal, clip: CanonicalClip) -> tuple[str, ...]:
+    """Note each gap of a proposal, in frames of the clip: proposer, error estimate (of the gap with the largest) and
+    remarks. Gaps without remarks share one note by proposer."""
+    fps, lost = float(clip.original.fps), torch.cat([clip.missing.joints, clip.missing.root[:, None]], dim=1)
+    edges = [0, *((lost[1:] != lost[:-1]).any(dim=1).nonzero()[:, 0] + 1).tolist(), len(lost)]
     noted: dict[object, list[GapSource]] = {}
     for number, source in enumerate(answer.attribute(query)):
         plain = not (source.reason or source.remark) and source.by == answer.source
@@ -471,9 +469,10 @@ def _note_gaps(query: GapQuery, answer: Proposal, *, fps: float) -> tuple[str, .
     for key, sources in sorted(noted.items(), key=lambda item: isinstance(item[0], str)):
         frames, words = [], [sources[0].by]
         for source in sources:
-            first = 0 if source.start == 0 else round(float(query.seconds[source.start - 1]) * fps) + 1
-            stop = round(float(query.seconds[min(source.stop, last)]) * fps)
-            frames.append(f"{first}:{stop + (source.stop > last)}")
+            ends = [round(float(query.seconds[frame] * fps)) for frame in (source.start, source.stop - 1)]
+            first = max(edge for edge in edges if edge <= ends[0])
+            stop = min(edge for edge in edges if edge > ends[1])
+            frames.append(f"{first}:{stop}")
         if answer.spread is not None and sources[0].by == answer.source:
             errors = [100 * answer.spread[one.start : one.stop].mean(dim=(0, 1)) for one in sources]
             median, percentile_90 = max(errors, key=lambda error: float(error[1])).tolist()

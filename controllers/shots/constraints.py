@@ -73,9 +73,7 @@ class Constraint:
         return {"constraint": self.name, **{name: getattr(self, name) for name in names}}
 
 
-def check_keys(
-    request: ShotRequest, motion: Motion, met: Sequence[MetPose], flat: Motion
-) -> tuple[Constraint, ...]:
+def check_keys(request: ShotRequest, motion: Motion, met: Sequence[MetPose], flat: Motion) -> tuple[Constraint, ...]:
     """Measure what is reached for and looked at on a motion at PRIOR_FPS; poses as they were met over a flat floor."""
     found, positions = list[Constraint](), motion.joint_positions()
     for reach in request.reaches:

@@ -29,7 +29,7 @@ class GapQuery:
     missing: MissingMask
     """Rotations of canonical joints and root positions that are missing."""
     seconds: Float[Tensor, " frames"]
-    """Time of each frame, seconds. A key between two frames is taken for one of them and stays at its own time."""
+    """Time of each frame, seconds; 1/30 s apart, but that the last is the clip's."""
     effector_targets: EffectorTargets | None = None
     """World positions that joints are to reach in frames in which they are missing."""
     keep_trajectory: bool = False
