@@ -1,7 +1,7 @@
 """Known rigs, one TOML each: which of their joints is which canonical one, and what their T-pose is."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from importlib.resources import as_file, files
@@ -115,6 +115,9 @@ class _Axes:
             raise RequestError(f"tpose: x and y must be two directions, got {self.x} and {self.y}")
 
 
+_Names = str | Annotated[tuple[str, ...], Field(min_length=1)]
+
+
 @dataclass(frozen=True)
 class _RigFile(_RigSettings):
     """Contents of a rig file; a joint may have several names, one a version of the rig."""
@@ -122,21 +125,42 @@ class _RigFile(_RigSettings):
     __pydantic_config__ = toml.STRICT
 
     name: str = ""
-    joints: Mapping[str, str | Annotated[tuple[str, ...], Field(min_length=1)]] = field(default_factory=dict)
+    left: _Names = ""
+    """What `*` stands for in names of the left side, one a version of the rig; the last serves further ones."""
+    right: _Names = ""
+    joints: Mapping[str, _Names] = field(default_factory=dict)
+    """Names by canonical joint; without its side, as UpperArm, for both."""
     tpose: Mapping[str, _Axes] = field(default_factory=dict)
     unit: float | str = "auto"
 
     def build(self, name: str) -> Rig:
         """Return the rig, of this name if it has none of its own."""
-        names = {joint: (own,) if isinstance(own, str) else own for joint, own in self.joints.items()}
+        sides = {"left": _as_tuple(self.left), "right": _as_tuple(self.right)}
+        given = {joint: _as_tuple(own) for joint, own in self.joints.items()}
+        parts = [joint for joint in given if "left" + joint in CANONICAL.names]
+        names = {joint: own for joint, own in given.items() if joint not in parts}
+        for side, words in sides.items():
+            for part in parts:
+                names[side + part] = tuple(_spell(own, words, version) for version, own in enumerate(given[part]))
+        settings = {item.name: getattr(self, item.name) for item in fields(_RigSettings)}
+        settings["also"] = tuple({_spell(own, words, 0): None for own in self.also for words in sides.values()})
         return Rig(
             name=self.name or name,
             joints={joint: own[0] for joint, own in names.items()},
             aliases={joint: own[1:] for joint, own in names.items() if len(own) > 1},
             tpose={joint: {"x": [*axes.x], "y": [*axes.y]} for joint, axes in self.tpose.items()},
             metres_per_unit=parse_unit(self.unit),
-            **{item.name: getattr(self, item.name) for item in fields(_RigSettings)},
+            **settings,
         )
+
+
+def _as_tuple(names: _Names) -> tuple[str, ...]:
+    return (names,) if isinstance(names, str) else names
+
+
+def _spell(name: str, words: Sequence[str], version: int) -> str:
+    """Spell a name for the side of these words."""
+    return name.replace("*", words[min(version, len(words) - 1)])
 
 
 def parse_unit(unit: str | float | None) -> float | None:
