@@ -1,4 +1,4 @@
-"""Rigs that invite mistakes: other scripts, prefixes, names in disorder, animals, two bodies, limbs too many."""
+"""Rigs that invite mistakes: other scripts, prefixes, names in disorder, animals, two bodies."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -49,19 +49,6 @@ def renamed(motion: Motion, name: Callable[[str], str]) -> Motion:
     old = motion.skeleton
     ends = {name(joint): end for joint, end in old.end_offsets.items()}
     return replace(motion, skeleton=Skeleton(tuple(map(name, old.names)), old.parents, old.offsets, ends))
-
-
-def with_joints(motion: Motion, joints: Sequence[tuple[str, str, tuple[float, float, float]]]) -> Motion:
-    """The motion with further joints that do not turn: name, the joint they hang from, offset in metres."""
-    old, names = motion.skeleton, list(motion.skeleton.names)
-    parents, offsets = list(old.parents), [*old.offsets]
-    for name, above, offset in joints:
-        parents.append(names.index(above))
-        names.append(name)
-        offsets.append(torch.tensor(offset, dtype=torch.float64))
-    still = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64).expand(motion.num_frames, len(joints), 4)
-    skeleton = Skeleton(tuple(names), tuple(parents), torch.stack(offsets), old.end_offsets)
-    return replace(motion, skeleton=skeleton, local_quat_xyzw=torch.cat([motion.local_quat_xyzw, still], dim=1))
 
 
 def stretched(motion: Motion, **lengths: float) -> Motion:
@@ -123,18 +110,8 @@ def swap(names: Mapping[str, str], *pairs: tuple[str, str]) -> dict[str, str]:
     return found
 
 
-def _limb(name: str, above: str, x: float) -> list[tuple[str, str, tuple[float, float, float]]]:
-    """Three bones to the side, as long as an arm's."""
-    return [
-        (f"{name}0", above, (0.4 * x, -0.1, 0.0)),
-        (f"{name}1", f"{name}0", (2.5 * x, 0.0, 0.0)),
-        (f"{name}2", f"{name}1", (2.5 * x, 0.0, 0.0)),
-        (f"{name}3", f"{name}2", (0.5 * x, 0.0, 0.0)),
-    ]
-
-
 def _cases() -> dict[str, Strange]:
-    mixamo, invented = names_of("mixamo"), _invented()
+    mixamo = names_of("mixamo")
     walk, truth = rigged(mixamo, arms_down_deg=30)
     plain = {c: own.removeprefix("mixamorig:") for c, own in mixamo.items()}
     bare = renamed(walk, lambda name: name.removeprefix("mixamorig:"))
@@ -166,20 +143,12 @@ def _cases() -> dict[str, Strange]:
             stretched(walk, **{f"mixamorig:{s}{p}": 2.6 for s in ("Left", "Right") for p in ("ForeArm", "Hand")}),
             (DOUBTFUL,),
             truth,
-            reason="arms are",
+            reason="2.6 times as long as a person's",
         ),
-        "further arms, invented": Strange(
-            with_joints(
-                rigged(invented)[0], [*_limb("a", invented["chest"], 0.1), *_limb("b", invented["chest"], -0.1)]
-            ),
-            (DOUBTFUL,),
-            invented,
-            reason="a further pair of limbs",
-        ),
-        "a dog with a person's names": Strange(animal(plain), (REFUSED,), reason="on four legs"),
+        "a dog with a person's names": Strange(animal(plain), (DOUBTFUL, REFUSED)),
         "a dog with paws": Strange(
             renamed(animal(plain, tail=False), lambda name: name.replace("Hand", "Paw").replace("Foot", "HindPaw")),
-            (REFUSED,),
+            (DOUBTFUL, REFUSED),
         ),
         "two people by name": Strange(
             pair(renamed(bare, "char1:{}".format), renamed(bare, "char2:{}".format)),
@@ -207,18 +176,6 @@ def _cases() -> dict[str, Strange]:
 
 def _told(rig: tuple[Motion, Mapping[str, str]], *allowed: str) -> tuple[Motion, tuple[str, ...], Mapping[str, str]]:
     return rig[0], allowed, rig[1]
-
-
-def _invented() -> dict[str, str]:
-    """Names that no program gives, of words that tell side and part."""
-    middle = ["Pelvis", "belly", "upperBack", "nape_neck", "skull"]
-    words = ["collarbone", "humerus", "elbow", "wrist", "thighbone", "kneejoint", "anklejoint", "toe_root"]
-    limbs = {
-        side + part: f"{word}.{side[0].upper()}"
-        for side in ("left", "right")
-        for part, word in zip(_SHORT, words, strict=True)
-    }
-    return dict(zip(("hips", "spine", "chest", "neck", "head"), middle, strict=True)) | limbs
 
 
 CASES = _cases()

@@ -18,7 +18,7 @@ from mapctl.errors import RequestError
 from mapctl.formats.character import CharacterSource
 from mapctl.kinematics.moving import rotate_world
 from mapctl.motion import Motion
-from mapctl.retarget.anatomy import RigPoses, goes_on_four_legs
+from mapctl.retarget.anatomy import RigPoses
 from mapctl.retarget.joint_matching import Match, correct_sides, match
 from mapctl.retarget.reference_pose import TPose, find_tpose, is_canonical_tpose, measure_bones, rest_rotations
 from mapctl.retarget.rigs import Rig, known_rigs, read_rig_toml
@@ -86,11 +86,6 @@ def identify_rig(skeleton: Skeleton, rig: Rig | None = None, *, motion: Motion |
     found = match(skeleton, rig, motion=motion)
     zero = RigPoses.zero(skeleton, found.joint_of)
     clip = None if motion is None else RigPoses.of(motion, found.joint_of)
-    if (rig is None or not rig.joints) and goes_on_four_legs(skeleton, zero, clip):
-        raise RequestError(
-            "this is a body on four legs, by the names of its joints or by its pose with all rotations zero; "
-            "--rig with a TOML file that names the joints of a person takes it all the same"
-        )
     stated = rig is not None and bool(rig.joints) and rig not in known_rigs()
     if not stated:
         found = correct_sides(found, zero, clip)

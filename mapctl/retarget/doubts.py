@@ -3,58 +3,40 @@
 Names, tree and bones are to be those of one two-legged person, and the T-pose is to agree with the clip.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from itertools import pairwise, product
 
 import torch
 
 from mapctl import rotations
 from mapctl.formats.units import FileUnit
-from mapctl.joint_names import Part, Side
+from mapctl.joint_names import Side
 from mapctl.joint_roles import classify_joints
 from mapctl.motion import Motion
 from mapctl.retarget import RigMap
 from mapctl.retarget.anatomy import (
     MIN_FRONT,
-    SIGNS,
     RigPoses,
-    find_further_limbs,
-    find_second_body,
+    ancestors,
+    descendants,
+    match_by_tree,
     measure_front,
     path_below,
-    stays_on_all_fours,
 )
-from mapctl.retarget.character import SIDES
+from mapctl.retarget.character import SIDES, TOES
 from mapctl.retarget.joint_matching import HELPER_NAME, KnownBy
-from mapctl.skeleton import CANONICAL, LIMBS, mirror_name
+from mapctl.skeleton import CANONICAL, Skeleton, mirror_name
 
 _MAX_LISTED = 4  # joints that have a line each; of more there is one line
 _MAX_SPEED = 12.0  # m/s of the hips, median over a second, of people on foot
 _LIMBS = ("LowerArm", "Hand", "LowerLeg", "Foot")
-_PARTS = {
-    "hips": {Part.HIPS},
-    "spine": {Part.TORSO},
-    "chest": {Part.TORSO},
-    "neck": {Part.NECK, Part.TORSO},
-    "head": {Part.HEAD, Part.NECK},
-    "Shoulder": {Part.SHOULDER},
-    "UpperArm": {Part.UPPER_ARM, Part.SHOULDER},
-    "LowerArm": {Part.LOWER_ARM, Part.UPPER_ARM},
-    "Hand": {Part.HAND},
-    "UpperLeg": {Part.UPPER_LEG, Part.HIPS, Part.LOWER_LEG},
-    "LowerLeg": {Part.LOWER_LEG, Part.UPPER_LEG},
-    "Foot": {Part.FOOT},
-    "Toes": {Part.TOES, Part.FOOT},
-}
-_HALVES = (0.5, 2.0)  # of an upper limb's bone by the lower one
 _SIDE_RATIO = 1.2  # of a bone by that of the other side
 _MIN_DIFFERENCE = 0.02  # metres by which bones of both sides differ at least, to differ
-_ARM_BY_LEG = (0.35, 1.4)
-_TRUNK_BY_LEG = (0.25, 1.4)
+_PROPORTION = 2.2  # by which a bone or the trunk is longer or shorter than the canonical one, of the legs' length
 _HIPS_METRES = (0.4, 1.6)  # metres of the hips over the toes, of people
-_MAX_SINK = 0.03  # metres that a joint of the trunk may be under the one before
-_NO_BONE = 0.01  # metres of a bone that is none
+_ASIDE = 0.05  # metres from the canonical hips, from which a joint has a side of them
+_NO_BONE = 0.01  # metres that are none
+_BODIES_APART = 0.1  # metres between the hips of two bodies
 _UPRIGHT = 0.5  # cosine between a body and the vertical, below which it lies
 
 
@@ -93,7 +75,7 @@ def assess_fit(rigmap: RigMap, motion: Motion | None = None) -> Fit:
     return Fit(
         (
             *(() if motion is None else _check_unit(rigmap, motion)),
-            *_find_other_bodies(rigmap, clip or zero),
+            *_check_tree(rigmap, clip or zero),
             *_compare_sides(rigmap, zero, clip or zero),
             *_check_names(rigmap),
             *_check_bones(RigPoses.zero(rigmap.skeleton)),
@@ -114,22 +96,37 @@ def _check_unit(rigmap: RigMap, motion: Motion) -> Iterator[Doubt]:
             yield Doubt(f"the hips travel at {fastest:.0f} m/s for a second: the unit may be wrong")
 
 
-def _find_other_bodies(rigmap: RigMap, poses: RigPoses) -> Iterator[Doubt]:
-    """Find a second body, a second pair of arms, and joints that do not hang from the one before in limb or trunk."""
-    joints, tree = rigmap.joints, rigmap.rig_skeleton
-    other = find_second_body(poses, joints)
+def _check_tree(rigmap: RigMap, poses: RigPoses) -> Iterator[Doubt]:
+    """Check for a second body, and for joints that do not hang from the one before in limb or trunk."""
+    joints = rigmap.joints
+    other = _find_second_body(poses, joints)
     if other is not None:
         yield Doubt(f"another body is in the file, with hips {_quote(rigmap, other)}; only one is used", ("hips",))
-    if any(how is not KnownBy.LIST for how in rigmap.match.known_by.values()):
-        pair = find_further_limbs(tree, joints)
-        if pair is not None:
-            names = " and ".join(_quote(rigmap, joint) for joint in pair)
-            yield Doubt(f"a further pair of limbs hangs from the trunk: {names}", ("leftUpperArm", "rightUpperArm"))
     for name, joint in joints.items():
         above = _find_above(rigmap, name)
-        if above is not None and not path_below(tree, joints[above], joint):
+        if above is not None and not path_below(rigmap.rig_skeleton, joints[above], joint):
             upper = _quote(rigmap, joints[above])
             yield Doubt(f"{name} {_quote(rigmap, joint)} does not hang from {above} {upper}", (name,))
+
+
+def _find_second_body(poses: RigPoses, joints: Mapping[str, int]) -> int | None:
+    """Find the hips of another body in the file than the one that is matched, by its tree; None where there is none.
+
+    A second set of joints in the same place, as the controls of a rig are, is no other body.
+    """
+    skeleton = poses.skeleton
+    near = descendants(skeleton, joints.values()) | ancestors(skeleton, joints.values())
+    rest = [joint for joint in range(skeleton.num_joints) if joint not in near]
+    index_of = {joint: number for number, joint in enumerate([-1, *rest])}
+    parents = (-1, *(index_of.get(skeleton.parents[joint], 0) for joint in rest))
+    offsets = torch.cat([torch.zeros(1, 3, dtype=skeleton.offsets.dtype), skeleton.offsets[rest]])
+    ends = {name: end for name, end in skeleton.end_offsets.items() if skeleton.index(name) in index_of}
+    other = match_by_tree(Skeleton(("", *(skeleton.names[j] for j in rest)), parents, offsets, ends))
+    if "hips" not in other or other["hips"] == 0:
+        return None
+    hips = rest[other["hips"] - 1]
+    apart = (poses.positions[:, hips] - poses.positions[:, joints["hips"]]).norm(dim=-1).mean()
+    return hips if float(apart) > _BODIES_APART else None
 
 
 def _find_above(rigmap: RigMap, name: str) -> str | None:
@@ -170,11 +167,6 @@ def _check_names(rigmap: RigMap) -> Iterator[Doubt]:
         listed = ", ".join(f"{name} ({quoted[name]})" for name in placed[:_MAX_LISTED])
         more = len(placed) - _MAX_LISTED
         yield Doubt(f"{len(placed)} joints are known by their positions alone: {listed} and {more} more", (*placed,))
-    roles = classify_joints(rigmap.rig_skeleton)
-    for name in placed:
-        part = roles[joints[name]].part
-        if part is not Part.OTHER and part not in _PARTS[_split(name)[1]]:
-            yield Doubt(f"{name} is {quoted[name]}, whose name is that of a {part.value}", (name,))
     # Joints but twists and other helpers between chest and arms, or within a limb of which no list has the next joint.
     skipped = set[int]()
     for name, joint in joints.items():
@@ -225,16 +217,14 @@ def _quote(rigmap: RigMap, joint: int) -> str:
 
 
 def _check_bones(body: RigPoses) -> Iterator[Doubt]:
-    """Check lengths of limbs, of both sides, of arms and trunk against legs; and what is over and beside what."""
-    length = dict(zip(CANONICAL.names, body.skeleton.offsets.norm(dim=-1).tolist(), strict=True))
-    for side, (limb, *parts) in product(SIDES, (("arm", "LowerArm", "Hand"), ("leg", "LowerLeg", "Foot"))):
-        joints = (side + parts[0], side + parts[1])
-        halves = [length[joint] for joint in joints]
-        if min(halves) < _NO_BONE:
-            yield Doubt(f"{min(joints, key=length.__getitem__)} is at the position of the joint above it", joints)
-        elif not _HALVES[0] <= halves[0] / halves[1] <= _HALVES[1]:
-            centimetres = " and ".join(f"{100 * half:.0f} cm" for half in halves)
-            yield Doubt(f"the {side} {limb} has halves of {centimetres}", joints)
+    """Check proportions, both sides, and what is over and beside the hips in the T-pose, by the canonical body."""
+    canonical = RigPoses.zero(CANONICAL)
+    length, usual = _measure_lengths(body), _measure_lengths(canonical)
+    for name in ("trunk", *(side + part for side in SIDES for part in _LIMBS)):
+        ratio = (length[name] / usual[name]) / max(length["legs"] / usual["legs"], _NO_BONE)
+        if not 1 / _PROPORTION <= ratio <= _PROPORTION:
+            what, joints = ("the trunk", ()) if name == "trunk" else (f"the bone to {name}", (name,))
+            yield Doubt(f"{what} is {ratio:.1f} times as long as a person's with such legs", joints)
     for name in CANONICAL.names:
         if name.startswith("left") and not name.endswith(("Toes", "Shoulder")):
             other = mirror_name(name)
@@ -242,28 +232,21 @@ def _check_bones(body: RigPoses) -> Iterator[Doubt]:
             if long > _SIDE_RATIO * short and long - short > _MIN_DIFFERENCE:
                 found = f"{100 * length[name]:.0f} and {100 * length[other]:.0f} cm"
                 yield Doubt(f"the bones to {name} and {other} differ: {found}", (name, other))
+    own, aside = (poses.positions[0] - poses.position("hips")[0] for poses in (body, canonical))
+    height = -float(own[TOES, 1].min())
+    if not _HIPS_METRES[0] <= height <= _HIPS_METRES[1]:
+        yield Doubt(f"hips are {height:.2f} m over the toes: the unit may be wrong")
+    wrong = (aside.abs() > _ASIDE) & (own * aside.sign() < -_NO_BONE)
+    for joint, axis in wrong[:, :2].nonzero().tolist():
+        name, where = CANONICAL.names[joint], ("beside", "above or below")[axis]
+        yield Doubt(f"{name} is on the wrong side of the hips in the T-pose, {where} them", (name,))
 
-    def over_hips(name: str, below: str = "hips") -> list[float]:
-        return (body.position(name) - body.position(below))[0].tolist()
 
-    leg, arm = (sum(LIMBS[side + end].length(body.skeleton) for side in SIDES) / 2 for end in ("Foot", "Hand"))
-    if leg >= _NO_BONE:
-        trunk = float((body.middle("UpperArm") - body.position("hips")).norm())
-        for name, own, allowed in (("arms are", arm, _ARM_BY_LEG), ("trunk is", trunk, _TRUNK_BY_LEG)):
-            if not allowed[0] <= own / leg <= allowed[1]:
-                yield Doubt(f"{name} {100 * own:.0f} cm long and legs {100 * leg:.0f} cm")
-        height = max(over_hips("hips", side + "Toes")[1] for side in SIDES)
-        if not _HIPS_METRES[0] <= height <= _HIPS_METRES[1]:
-            yield Doubt(f"hips are {height:.2f} m over the toes: the unit may be wrong")
-    for below, above in pairwise(("hips", "spine", "chest", "neck", "head")):
-        if over_hips(above, below)[1] < -_MAX_SINK:
-            yield Doubt(f"{above} is below {below} in the T-pose", (below, above))
-    for side, sign in SIGNS:
-        if over_hips(side + "UpperArm")[1] < 0:
-            yield Doubt(f"{side}UpperArm is below the hips in the T-pose", (side + "UpperArm",))
-        for part in ("UpperArm", "UpperLeg"):
-            if sign * over_hips(side + part)[0] < -_NO_BONE:
-                yield Doubt(f"{side + part} is on the other side of the hips", (side + part,))
+def _measure_lengths(body: RigPoses) -> dict[str, float]:
+    """Measure the bones to each canonical joint, both legs, and from hips to shoulders, metres."""
+    length = dict(zip(CANONICAL.names, body.skeleton.offsets.norm(dim=-1).tolist(), strict=True))
+    legs = sum(length[side + part] for side in SIDES for part in ("LowerLeg", "Foot"))
+    return length | {"legs": legs, "trunk": float((body.middle("UpperArm") - body.position("hips")).norm())}
 
 
 def _check_poses(rigmap: RigMap, clip: RigPoses) -> Iterator[Doubt]:
@@ -271,9 +254,7 @@ def _check_poses(rigmap: RigMap, clip: RigPoses) -> Iterator[Doubt]:
     up = clip.up()
     if rigmap.upright_quat_xyzw is not None:
         up = rotations.rotate(rigmap.upright_quat_xyzw.expand(len(up), 4), up)
-    if stays_on_all_fours(clip):
-        yield Doubt("hands stand beside the feet under a level trunk in the whole clip: this may be an animal")
-    elif float(up[:, 1].median()) < _UPRIGHT:
-        yield Doubt(f"the body lies or hangs upside down in most frames if {rigmap.up} is up")
+    if float(up[:, 1].median()) < _UPRIGHT:
+        yield Doubt(f"the body lies, crawls or hangs upside down in most frames if {rigmap.up} is up")
     if rigmap.tpose_doubt:
         yield Doubt(rigmap.tpose_doubt)

@@ -282,7 +282,7 @@ CASES = {
     "info in.bvh -o rig.jpg": "--out writes .png, not .jpg",
     "info in.bvh -o none/rig.png": "none",
     "info -o rig.png": "a picture of a clip's rig: mapctl info CLIP -o FILE.png",
-    "convert dog.bvh a.bvh --rig canonical": "on four legs",
+    "convert snake.bvh a.bvh --rig canonical": "no joint is found for hips",
     f"{FOLLOW} --rig part.toml": "rig part names no joint for spine, ",
     f"{DENOISE} --rig nobody": "nobody",
     # denoise
@@ -407,7 +407,7 @@ def folder(tmp_path_factory):
         walk(5).save(folder / "alike" / name)
     walk(40).slice(0, 1).save(folder / "short" / "one.bvh")
     pair(6).write(folder, subject="01", take="in")
-    STRANGE_RIGS["a dog with a person's names"].motion.save(folder / "dog.bvh")
+    STRANGE_RIGS["a snake"].motion.save(folder / "snake.bvh")
     np.savez(folder / "objects.npz", **{**npz.to_arrays(walk(2)), "names": np.array([{}] * 21)})
     texts = {
         **{f"{kind}.bvh": text for kind, text in MOTIONS.items()},
