@@ -29,10 +29,9 @@ from mapctl.formats.positions import Capture
 from mapctl.formats.text import shorten, warn_once
 from mapctl.formats.units import FileUnit, guess_unit
 from mapctl.motion import Motion
-from mapctl.skeleton import CANONICAL, LIMBS, Skeleton, mirror_name
+from mapctl.skeleton import CANONICAL, Skeleton, mirror_name
 
 _PARENTS, _NAMES = CANONICAL.parents, CANONICAL.names
-_CHEST, _SHOULDERS = _NAMES.index("chest"), [_NAMES.index(f"{side}UpperArm") for side in ("left", "right")]
 _TRUNK = tuple(_NAMES.index(name) for name in ("spine", "chest", "neck", "head", "leftShoulder", "rightShoulder"))
 _SHANK = ("LowerLeg", "Foot")
 _LOOSE = ("spine", "chest", "neck", "head", "Shoulder", "UpperArm", "UpperLeg", "Toes")  # bones of any direction
@@ -47,11 +46,10 @@ _EVIDENCE = 1.0  # independent observations that a clip is worth: errors of skin
 _REST_SIGMA = {"spine": 0.3, "chest": 0.3, "neck": 0.3, "head": 0.5, "Shoulder": 0.3, "Hand": 0.5, "Toes": 0.3}
 _LIMB_SIGMA, _RANGE_SIGMA = 1.5, 0.1  # radians from the mid pose, and beyond a joint's range
 _ELBOW = math.radians(5.0)  # by which a forearm turns across its hinge
-_OUTLIER = 0.08  # metres at which a marker counts a quarter
+_OUTLIER, _FAR_OUTLIER = 0.08, 1.0  # metres at which a marker counts a quarter, and while poses are far from it
 _LOST_TRUST = 0.003  # weight of a marker that is lost, and interpolated
-_TURNS, _STEPS = 5, 16  # of poses and body in turn; of Gauss and Newton
+_TURNS, _STEPS = 4, 16  # of body and poses in turn; of Gauss and Newton
 _LONGEST_STEP = 0.5  # radians
-_PARENT_MOMENT, _HINGE = 0.005, 0.5  # m^2 with which a start keeps to the parent's rotation; weight of a bend
 _TILT = math.radians(10.0)  # of the markers of a standing pelvis, forward
 _SUBSET, _CHUNK = 120, 128  # frames over which a body is measured; frames that are solved at once
 _FAR = 2.5  # of the height of the trunk over the feet, an axis along which a body travels farther does not point up
@@ -110,16 +108,16 @@ def fit(
     frames = _pick_frames(seen)
     some, shown = positions[frames], seen[frames]
     body = first = _estimate_body(landmarks, some)
-    pose = _start_poses(body, some)
     trust, free = torch.where(seen, 1.0, _LOST_TRUST), torch.tensor([mark.sigma == _FREE_SIGMA for mark in landmarks])
-    for turn in range(_TURNS):  # where free markers are is not known at first
-        known = trust[frames] * torch.where(free & (turn == 0), _LOST_TRUST, 1.0)
-        pose = _solve_poses(body, some, known, *pose, steps=_STEPS if turn == 0 else _STEPS // 2)
+    known = trust[frames] * torch.where(free, _LOST_TRUST, 1.0)  # where free markers are is not known at first
+    pose = _find_poses(body, some, known, torch.eye(3).double().expand(len(some), len(_NAMES), 3, 3))
+    for _ in range(_TURNS):
         body = _measure_body(body, first, some, shown, *pose)
-    solved = [
-        _solve_poses(body, near, known, *_start_poses(body, near), steps=_STEPS)
-        for near, known in zip(positions.split(_CHUNK), trust.split(_CHUNK), strict=True)
-    ]
+        pose = _solve_poses(body, some, trust[frames], *pose, outlier=_OUTLIER, steps=_STEPS // 2)
+    body = _measure_body(body, first, some, shown, *pose)
+    near = pose[1][(torch.arange(len(positions))[:, None] - frames).abs().argmin(dim=1)]
+    chunks = zip(positions.split(_CHUNK), trust.split(_CHUNK), near.split(_CHUNK), strict=True)
+    solved = [_find_poses(body, *chunk) for chunk in chunks]
     root, local = (torch.cat(values) for values in zip(*solved, strict=True))
     foot = _NAMES.index("leftFoot")
     size = float(body.bones[foot].norm() / CANONICAL.offsets[foot].norm())
@@ -355,58 +353,25 @@ def _estimate_body(landmarks: list[Landmark], positions: Float[Tensor, "frames m
     return _Body(landmarks, bones, offsets)
 
 
-def _start_poses(
-    body: _Body, positions: Float[Tensor, "frames markers 3"]
+def _find_poses(
+    body: _Body,
+    positions: Float[Tensor, "frames markers 3"],
+    trust: Float[Tensor, "frames markers"],
+    local: Float[Tensor, "frames joints 3 3"],
 ) -> tuple[Float[Tensor, "frames 3"], Float[Tensor, "frames joints 3 3"]]:
-    """Estimate poses in closed form, from the root down: each joint has the rotation nearest to its parent's that turns
-    the points of its segment to where they are (Kabsch 1976); knees and elbows turn the bones above them."""
-    marks, bones = body.landmarks, body.bones
-    within = torch.stack(
-        [at + (mark.of != mark.on) * bones[mark.of] for mark, at in zip(marks, body.offsets, strict=True)]
-    )
-    own = [n for n, mark in enumerate(marks) if mark.sigma < _FREE_SIGMA]
-    centres = {
-        joint: torch.stack([positions[:, n] for n in own if marks[n].of == joint]).mean(dim=0)
-        for joint in {marks[n].of for n in own} - {0}
-    }
-    left, right = ([n for n in own if marks[n].on == 0 and sign * within[n, 0] > 0] for sign in (1, -1))
-    lateral = positions[:, left].mean(dim=1) - positions[:, right].mean(dim=1)
-    above = rotations.to_matrix(rotations.about_y(torch.atan2(-lateral[:, 2], lateral[:, 0])))
-    joints, world, limbs = [], [], {limb.upper: limb for limb in LIMBS.values()}
-    for joint, parent in enumerate(_PARENTS):
-        points = [(positions[:, n], within[n], 1.0) for n in own if marks[n].on == joint]
-        if parent >= 0:
-            above, predicted = world[parent], joints[parent] + (world[parent] @ bones[joint])
-            joints.append(predicted if joint in _TRUNK else centres.get(joint, predicted))
-            points.append((joints[joint], 0 * bones[joint], 0.3 if joint == _CHEST else 1.0))
-        for end in _SHOULDERS if joint in (0, _CHEST) else ():  # collars hardly move
-            if end in centres:
-                at = sum((bones[j] for j in _find_path(end, joint)), torch.zeros(3).double())
-                points.append((centres[end], at, 0.3 if joint else 0.05))
-        weight = sum(w for _, _, w in points) or 1.0
-        middle = sum((w * x for x, _, w in points), torch.zeros(3).double()) / weight
-        centre = sum((w * at for _, at, w in points), torch.zeros(3).double()) / weight
-        moment = _PARENT_MOMENT * above
-        for x, at, w in points:
-            moment = moment + w * (x - middle)[:, :, None] * (at - centre)
-        if (limb := limbs.get(joint)) and limb.lower in centres and limb.end in centres:
-            upper, lower = centres[limb.lower] - joints[joint], centres[limb.end] - centres[limb.lower]
-            straight = bones[limb.lower] / bones[limb.lower].norm()
-            hinge = torch.linalg.cross(straight, -torch.tensor(limb.bend_direction).double())
-            moment = moment + _HINGE * torch.linalg.cross(upper, lower)[:, :, None] * hinge
-        first, _, last = torch.linalg.svd(moment)
-        first[:, :, 2] *= torch.det(first @ last)[:, None]  # no reflection
-        world.append(first @ last)
-        if joint == 0:
-            joints.append(middle - world[0] @ centre)
-    quats = torch.stack(world, dim=1)
-    local = torch.cat([quats[:, :1], quats[:, list(_PARENTS[1:])].mT @ quats[:, 1:]], dim=1)
-    return joints[0], local
-
-
-def _find_path(end: int, start: int) -> list[int]:
-    """Return the joints from one joint up to another, without that one."""
-    return [] if end == start else [end, *_find_path(_PARENTS[end], start)]
+    """Find poses from others, moved and turned to where the markers of the trunk are nearest (Kabsch 1976); what is an
+    outlier shows once poses are near."""
+    local = torch.cat([torch.eye(3).double().expand(len(local), 1, 3, 3), local[:, 1:]], dim=1)
+    own = [n for n, mark in enumerate(body.landmarks) if mark.sigma < _FREE_SIGMA and mark.on in (0, *_TRUNK)]
+    within, wanted = body.place(torch.zeros(1, 3).double(), local)[0][:, own], positions[:, own]
+    centre, middle = within.mean(dim=1), wanted.mean(dim=1)
+    first, _, last = torch.linalg.svd((wanted - middle[:, None]).mT @ (within - centre[:, None]))
+    first[:, :, 2] *= torch.det(first @ last)[:, None]  # no reflection
+    local[:, 0] = first @ last
+    pose = middle - (local[:, 0] @ centre[..., None])[..., 0], local
+    for outlier in (_FAR_OUTLIER, _OUTLIER):
+        pose = _solve_poses(body, positions, trust, *pose, outlier=outlier, steps=_STEPS)
+    return pose
 
 
 def _solve_poses(
@@ -416,6 +381,7 @@ def _solve_poses(
     root: Float[Tensor, "frames 3"],
     local: Float[Tensor, "frames joints 3 3"],
     *,
+    outlier: float,
     steps: int,
 ) -> tuple[Float[Tensor, "frames 3"], Float[Tensor, "frames joints 3 3"]]:
     """Solve for the poses whose markers are nearest, by Levenberg's and Marquardt's method on turns about the world's
@@ -434,12 +400,12 @@ def _solve_poses(
         beyond = ranges.find_excess(angles).amax(dim=-1) > 0
         held = torch.stack([rest.expand(frames, -1), beyond * _RANGE_SIGMA**-2])
         square = missed.square().sum(dim=-1)
-        cost = (trust * square / (1 + square / _OUTLIER**2)).sum(dim=1) / _SIGMA**2
+        cost = (trust * square / (1 + square / outlier**2)).sum(dim=1) / _SIGMA**2
         cost = cost + (held * away.square().sum(dim=-1)).sum(dim=(0, 2))
         levers = (points[:, :, None] - joints[:, None]) * moves[..., None]
         turns = torch.linalg.cross(one.expand(*levers.shape, 3), levers[..., None, :]).movedim(-1, 2).flatten(3)
         jacobian = torch.cat([one.expand(*missed.shape, 3), turns], dim=3).flatten(1, 2)
-        weighted = jacobian * (trust * _weigh(missed)).repeat_interleave(3, dim=1)[..., None]
+        weighted = jacobian * (trust * _weigh(missed, outlier)).repeat_interleave(3, dim=1)[..., None]
         normal, gradient = weighted.mT @ jacobian, (weighted.mT @ missed.flatten(1)[..., None])[..., 0]
         # a turn about axes of the world ahead of the joint's rotation is itself the change of its distance to a target
         above = world[:, parents]
@@ -470,9 +436,9 @@ def _find_ranges() -> joint_ranges.JointRanges:
     return replace(ranges, low=low, high=high)
 
 
-def _weigh(missed: Float[Tensor, "frames markers 3"]) -> Float[Tensor, "frames markers"]:
+def _weigh(missed: Float[Tensor, "frames markers 3"], outlier: float) -> Float[Tensor, "frames markers"]:
     """Weigh markers by how far off they are, 1/m^2."""
-    return (1 + missed.square().sum(dim=-1) / _OUTLIER**2) ** -2 / _SIGMA**2
+    return (1 + missed.square().sum(dim=-1) / outlier**2) ** -2 / _SIGMA**2
 
 
 def _find_rest_sigma(name: str) -> float:
@@ -490,7 +456,7 @@ def _measure_body(
     """Measure bones, the same on both sides, and marker offsets over poses: linear least squares in which the position
     of the root is free, near the first estimate."""
     points, _, world = body.place(root, local)
-    weight = _weigh(positions - points) * seen
+    weight = _weigh(positions - points, _OUTLIER) * seen
     markers, tied = (
         len(body.landmarks),
         {name: n for n, name in enumerate(n for n in _NAMES[1:] if not n.startswith("right"))},
