@@ -188,6 +188,16 @@ def test_a_toml_file_wins(tmp_path):
     assert_returns(motion, canonical, rigmap)
 
 
+def test_a_toml_file_names_both_sides_at_once(tmp_path):
+    path = tmp_path / "ours.toml"
+    joints = 'hips = "Pelvis"\nUpperArm = ["*Arm", "*_arm", "arm_*"]\nleftHand = "Hook"\n'
+    path.write_text(f'left = ["L", "left"]\nright = ["R", "right"]\nalso = ["*Thumb"]\n[joints]\n{joints}')
+    rig = retarget.load_rig(path)
+    assert rig.joints == {"hips": "Pelvis", "leftHand": "Hook", "leftUpperArm": "LArm", "rightUpperArm": "RArm"}
+    assert rig.aliases["rightUpperArm"] == ("right_arm", "arm_right")
+    assert rig.also == ("LThumb", "RThumb")
+
+
 SKELETONS = {"bandai-namco": bandai_skeleton(), "cmu-daz": cmu_skeleton(), "canonical": CANONICAL}
 each_rig = pytest.mark.parametrize("rig", SKELETONS)
 
