@@ -32,7 +32,6 @@ from mapctl.motion import Motion
 from mapctl.skeleton import CANONICAL, Skeleton, mirror_name
 
 _PARENTS, _NAMES = CANONICAL.parents, CANONICAL.names
-_TRUNK = tuple(_NAMES.index(name) for name in ("spine", "chest", "neck", "head", "leftShoulder", "rightShoulder"))
 _SHANK = ("LowerLeg", "Foot")
 _LOOSE = ("spine", "chest", "neck", "head", "Shoulder", "UpperArm", "UpperLeg", "Toes")  # bones of any direction
 _NEEDED = [side + part for side in ("left", "right") for part in ("UpperLeg", "LowerLeg", "Foot")]
@@ -359,11 +358,11 @@ def _find_poses(
     trust: Float[Tensor, "frames markers"],
     local: Float[Tensor, "frames joints 3 3"],
 ) -> tuple[Float[Tensor, "frames 3"], Float[Tensor, "frames joints 3 3"]]:
-    """Find poses from others, moved and turned to where the markers of the trunk are nearest (Kabsch 1976); what is an
+    """Find poses from others, moved and turned to where their markers are nearest (Kabsch 1976); what is an
     outlier shows once poses are near."""
     local = torch.cat([torch.eye(3).double().expand(len(local), 1, 3, 3), local[:, 1:]], dim=1)
-    own = [n for n, mark in enumerate(body.landmarks) if mark.sigma < _FREE_SIGMA and mark.on in (0, *_TRUNK)]
-    within, wanted = body.place(torch.zeros(1, 3).double(), local)[0][:, own], positions[:, own]
+    own = [n for n, mark in enumerate(body.landmarks) if mark.sigma < _FREE_SIGMA]
+    within, wanted = body.place(0 * positions[:, 0], local)[0][:, own], positions[:, own]
     centre, middle = within.mean(dim=1), wanted.mean(dim=1)
     first, _, last = torch.linalg.svd((wanted - middle[:, None]).mT @ (within - centre[:, None]))
     first[:, :, 2] *= torch.det(first @ last)[:, None]  # no reflection
