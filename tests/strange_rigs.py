@@ -145,6 +145,9 @@ def _cases() -> dict[str, Strange]:
             truth,
             reason="2.6 times as long as a person's",
         ),
+        "both thighs on one side": Strange(
+            stretched(walk, **{"mixamorig:LeftUpLeg": -1.0}), (DOUBTFUL,), reason="on the wrong side of the hips"
+        ),
         "a dog with a person's names": Strange(animal(plain), (DOUBTFUL, REFUSED)),
         "a dog with paws": Strange(
             renamed(animal(plain, tail=False), lambda name: name.replace("Hand", "Paw").replace("Foot", "HindPaw")),
