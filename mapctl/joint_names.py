@@ -155,23 +155,19 @@ def find_joint(wanted: str, names: Sequence[str], canonical: Callable[[], Mappin
 def describe_nearest(wanted: str, names: Sequence[str], roles: Sequence[Role] | None = None) -> str:
     """Describe the few names nearest to a wanted one, the nearest first, for the end of a refusal.
 
-    They stay on the side and the limb that it names, if any name is there. `roles` are those of the names, else the
-    names themselves show them.
+    Those on the side and the limb that it names come first. `roles` are those of the names, else the names themselves
+    show them.
     """
     role_of = dict(zip(names, map(classify_joint, names) if roles is None else roles, strict=True))
     asked, plain = classify_joint(wanted), normalise_name(wanted)
+    limb = next((parts for parts in _LIMBS if asked.part in parts), set(Part))
 
-    def kept(fits: Callable[[Role], bool], some: Sequence[str]) -> Sequence[str]:
-        return [name for name in some if fits(role_of[name])] or some
+    def distance(name: str) -> tuple[bool, bool, bool, float]:
+        side, part = role_of[name].side, role_of[name].part
+        likeness = SequenceMatcher(None, plain, normalise_name(name)).ratio()
+        return asked.side not in (side, Side.MIDDLE), part not in limb, part is not asked.part, -likeness
 
-    if asked.side is not Side.MIDDLE:
-        names = kept(lambda r: r.side is asked.side, names)
-    for limb in _LIMBS:
-        if asked.part in limb:
-            names = kept(lambda r, limb=limb: r.part in limb, names)
-    likeness = {name: SequenceMatcher(None, plain, normalise_name(name)).ratio() for name in names}
-    nearest = sorted(names, key=lambda name: (role_of[name].part is not asked.part, -likeness[name]))
-    first, *others = nearest[:_MAX_SUGGESTIONS] or ["none"]
+    first, *others = sorted(names, key=distance)[:_MAX_SUGGESTIONS] or ["none"]
     return f"the nearest is {first}" + (f", then {' and '.join(others)}" if others else "")
 
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
+from numpy.polynomial.polynomial import polyder, polyval
 from torch import Tensor
 
 
@@ -44,24 +45,14 @@ class MinimumJerkTrack:
     def move(self, seconds: float) -> "MinimumJerkTrack":
         """Move on for so many seconds, along the polynomial of fifth degree that ends at rest in the goal."""
         if self.left <= seconds:
-            return replace(MinimumJerkTrack.rest_at(self.goal), left=0.0)
+            return MinimumJerkTrack.rest_at(self.goal)
         left, away = self.left, self.goal - self.value
         speed, bend = self.velocity * left, self.acceleration * left**2
-        third, fourth, fifth = (
-            10 * away - 6 * speed - 1.5 * bend,
-            -15 * away + 8 * speed + 1.5 * bend,
-            6 * away - 3 * speed - 0.5 * bend,
+        third = 10 * away - 6 * speed - 1.5 * bend
+        fourth = -15 * away + 8 * speed + 1.5 * bend
+        fifth = 6 * away - 3 * speed - 0.5 * bend
+        coefficients = torch.stack([self.value, speed, 0.5 * bend, third, fourth, fifth]).numpy()
+        value, velocity, acceleration = (
+            torch.as_tensor(polyval(seconds / left, polyder(coefficients, order)) / left**order) for order in range(3)
         )
-        share = seconds / left
-        return MinimumJerkTrack(
-            self.value
-            + speed * share
-            + 0.5 * bend * share**2
-            + third * share**3
-            + fourth * share**4
-            + fifth * share**5,
-            (speed + bend * share + 3 * third * share**2 + 4 * fourth * share**3 + 5 * fifth * share**4) / left,
-            (bend + 6 * third * share + 12 * fourth * share**2 + 20 * fifth * share**3) / left**2,
-            self.goal,
-            left - seconds,
-        )
+        return MinimumJerkTrack(value, velocity, acceleration, self.goal, left - seconds)

@@ -123,7 +123,7 @@ class LatentNoiseSolver:
         unknowns, best = self._run_round(request, start, meter)
         start_energy = best.start_energy
         for _ in range(self.rounds - 1):
-            if meter.exhausted or not best.energy > _STUCK_ENERGY * frames:
+            if not meter.remaining or not best.energy > _STUCK_ENERGY * frames:
                 break
             replanned, again = self._run_round(request, best.x, meter)
             if not again.energy < best.energy:

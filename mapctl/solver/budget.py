@@ -38,7 +38,7 @@ class Meter:
         now = self._clock()
         if self.budget.evaluation_seconds is not None and self._taken:
             self._expected = (now - self._taken_at) / self._taken
-        if self._late(count) or not self._affords(count):
+        if self._late(count) or count > self.remaining:
             return False
         self._taken_at, self._taken = now, count
         self.evaluations += count
@@ -50,14 +50,6 @@ class Meter:
         limit = math.inf if self.budget.evaluations is None else self.budget.evaluations
         return 0 if self._late() else max(0, limit - self.evaluations)
 
-    @property
-    def exhausted(self) -> bool:
-        """Whether not one more evaluation is allowed."""
-        return self._late() or not self._affords(1)
-
     def _late(self, count: int = 1) -> bool:
         now = self._clock() - self._began
         return self.budget.seconds is not None and now + count * self._expected >= self.budget.seconds
-
-    def _affords(self, count: int) -> bool:
-        return self.budget.evaluations is None or self.evaluations + count <= self.budget.evaluations

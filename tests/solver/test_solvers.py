@@ -143,7 +143,7 @@ def test_a_deadline_is_checked_before_every_evaluation():
     meter = Meter(Budget(seconds=0.5), clock=lambda: now[0])
     minimise(slow, rows(-1.2, 1.0), meter=meter)
     assert meter.evaluations == 3
-    assert meter.exhausted
+    assert not meter.remaining
 
 
 def test_an_evaluation_that_would_end_too_late_is_not_begun():
