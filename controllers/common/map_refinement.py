@@ -19,7 +19,7 @@ from mapctl.contacts import compute_rest_log_probability, debounced, fit_support
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose
 from mapctl.inbetweening.effector_targets import EffectorTargets
 from mapctl.motion import Motion
-from mapctl.numerics.intervals import last_observed, next_observed
+from mapctl.numerics.intervals import count_frames_to_observed
 from mapctl.pose import BodyPose, decode
 from mapctl.problem import density_selection
 from mapctl.problem.density_selection import DensityEnsemble, DensityInterval
@@ -217,7 +217,5 @@ def _ramp_from_observed(observed: Bool[Tensor, "frames columns"], ramp: float) -
     """Ramp from 0 where a column is observed smoothly to 1 so many frames away; 1 throughout for a ramp of 0 frames."""
     if ramp <= 0 or bool(observed.all()):
         return torch.ones(observed.shape)
-    frame = torch.arange(len(observed))[None]
-    distance = torch.minimum((frame - last_observed(observed.T)).abs(), (frame - next_observed(observed.T)).abs()).T
-    share = torch.sin(0.5 * math.pi * (distance / ramp).clamp(max=1)).square()
-    return torch.where(observed.any(dim=0), share, 1.0)
+    distance = count_frames_to_observed(observed.T).amin(dim=-1).T
+    return torch.sin(0.5 * math.pi * (distance / ramp).clamp(max=1)).square()

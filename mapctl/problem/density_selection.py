@@ -76,14 +76,6 @@ class DensityEnsemble:
         assert isinstance(state, tuple)
         return tuple(one.advance(before, committed) for one, before in zip(self.densities, state, strict=True))
 
-    def select(
-        self, features: Float[Tensor, "frames size"], state: DensityState | tuple[DensityState, ...]
-    ) -> tuple["DensityChoice", DensityState]:
-        """Select the density under which the frames are likeliest, and its state."""
-        assert isinstance(state, tuple)
-        choice = select_density(self.densities, features, state)
-        return choice, state[list(self.densities).index(choice.density)]
-
 
 def select_density(
     densities: Sequence[AnyDensity], features: Float[Tensor, "frames size"], states: Sequence[DensityState]

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mapctl.features import LAYOUT
 from mapctl.pose import BodyPose
-from mapctl.problem.density_selection import DensityEnsemble
+from mapctl.problem.density_selection import DensityEnsemble, select_density
 from mapctl.problem.objective import Objective, Parametrisation
 from mapctl.problem.solution import Ledger, WindowRecord
 from mapctl.problem.unknowns import LatentNoise, PoseOffsets, WindowRequest
@@ -236,7 +236,10 @@ class PoseOffsetSolver:
         proposal, contacts = self.proposal.slice(first, stop), self.contacts[first:stop]
         choice = None
         if isinstance(context.density, DensityEnsemble) and context.density.densities:
-            choice, state = context.density.select(proposal.features(context.ground_pose, contacts), context.state)
+            assert isinstance(context.state, tuple)
+            densities, features = list(context.density.densities), proposal.features(context.ground_pose, contacts)
+            choice = select_density(densities, features, context.state)
+            state = context.state[densities.index(choice.density)]
             context = replace(context, density=choice.density, state=state)
             terms = (*terms, Likelihood(self.temperature / choice.weight))
         offsets = PoseOffsets(context, proposal, contacts, self.sigma[first:stop])
