@@ -80,12 +80,8 @@ def estimate_floor_heights(
 
 
 def remove_short_runs(mask: Bool[Tensor, "frames feet"], shortest: int) -> Bool[Tensor, "frames feet"]:
-    """Remove runs of true shorter than `shortest` frames: a morphological opening."""
-    if len(mask) < shortest:
-        return torch.zeros_like(mask)
-    whole = mask.T.unfold(-1, shortest, 1).all(dim=-1)  # windows that are true throughout
-    spread = torch.nn.functional.pad(whole, (shortest - 1, shortest - 1))
-    return spread.unfold(-1, shortest, 1).any(dim=-1).T
+    """Remove runs of true shorter than `shortest` frames."""
+    return torch.from_numpy(scipy.ndimage.binary_opening(mask.numpy(), np.ones((shortest, 1))))
 
 
 def support_speed(

@@ -21,7 +21,6 @@ from mapctl.numerics import gaussian
 
 _AMBIGUOUS_DOT = 0.5  # cosine of half the turn between two frames, 120 degrees, from which on they do not tell
 _MEAN_FRAMES = 6.0  # frames, sigma, over which rotations are averaged: fewer can be led astray themselves
-_SQUARINGS = 4  # of the second moment, whose 16th power leaves its first eigenvector
 
 
 def choose_continuous_signs(quats: Float[Tensor, "frames joints 4"]) -> Float[Tensor, "frames joints 4"]:
@@ -44,15 +43,9 @@ def average_over_time(
     """Average the rotations that were observed about each frame, whatever their signs: the first eigenvector of the
     quaternions' second moment (Markley et al. 2007), weighted by a Gaussian. The sign of each mean is any."""
     outer = torch.einsum("fji,fjk->fjik", quats, quats) * seen.to(quats)[..., None, None]
-    power = gaussian.smooth(outer, _MEAN_FRAMES, ends="constant")
-    for _ in range(_SQUARINGS):
-        power = power / power.flatten(2).norm(dim=-1).clamp_min(1e-12)[..., None, None]
-        power = power @ power
-    # Each column is the eigenvector times one of its numbers: the longest is the least rounded.
-    longest = power.norm(dim=-2).argmax(dim=-1)
-    column = torch.take_along_dim(power, longest[..., None, None], dim=-1)[..., 0]
-    size = column.norm(dim=-1, keepdim=True)
-    return torch.where(size > 0, column / size.clamp_min(1e-30), quats)
+    moment = gaussian.smooth(outer, _MEAN_FRAMES, ends="constant")
+    size, axes = torch.linalg.eigh(moment)
+    return torch.where(size[..., -1:] > 0, axes[..., -1], quats)
 
 
 RESOLUTION = 1e-5
