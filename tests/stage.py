@@ -71,11 +71,10 @@ class Actor:
 
 
 @contextmanager
-def live_app(actors: list[Actor], looks: list[CharacterLook] | None = None, **more) -> Iterator[LiveApp]:
+def live_app(actors: list[Actor], look: CharacterLook | None = None, **more) -> Iterator[LiveApp]:
     """The viewer of these characters; `more` as LiveApp takes it."""
     labels = {"gait": ["run", "walk"], "style": ["old"]}
-    looks = looks or [CharacterLook() for _ in actors]
-    show = LiveApp(actors, looks, port=8090, fastest=3.8, labels=labels, **more)
+    show = LiveApp(actors, look or CharacterLook(), port=8090, fastest=3.8, labels=labels, **more)
     try:
         yield show
     finally:

@@ -1,14 +1,14 @@
 """`mapctl live`: characters in the browser, steered live."""
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import UseAppendAction, arg
+from tyro.conf import arg
 
 import priors
 from controllers.common.character import Character
@@ -16,15 +16,12 @@ from controllers.steering.process import CharacterProcess, CharacterRequest
 from controllers.steering.steer import SteerSettings
 from mapctl.commands.shared import options, outputs, streaming
 from mapctl.commands.shared.command import ModelCommand
-from mapctl.commands.shared.inputs import as_character, read_character, read_drawn_character, read_rigged
+from mapctl.commands.shared.inputs import as_character, read_character, read_drawn_character
 from mapctl.errors import RequestError
 from mapctl.intent.steering import Command
-from mapctl.motion import Motion
-from mapctl.retarget.carry import retarget_motion
 from mapctl.streaming.messages import Endpoint
 from mapctl.terms import FootContact
 from priors import checkpoints
-from scenes.drawn_character import DrawnCharacter
 
 if TYPE_CHECKING:
     from mapctl.streaming.receiver import OscReceiver
@@ -44,12 +41,11 @@ class Live(ModelCommand, options.ReadOptions, streaming.StreamOptions):
     """Port of the page, on 127.0.0.1 only; the next free port if this one is taken."""
     characters: options.Count = 1
     """Number of characters, side by side; each computes on a core of its own as long as there are cores."""
-    character: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="CHARACTER")] = ()
-    """File of a skinned character, as .glb or .vrm, that is shown with its own mesh and moves on its own bones; may be
-    given several times, for the first character, the second and so on, and the last one for all others."""
+    character: options.MaybeCharacter = None
+    """File of a skinned character, as .glb or .vrm, that is shown with its own mesh and moves on its own bones."""
     rig: options.OutRig = "canonical"
-    """Joints and bones on which characters move, shown as mannequins: canonical, or those of a clip, a preset or a rig
-    file. Recordings are on them, of a --character too, which is retargeted when it is saved."""
+    """Joints and bones on which characters move and are recorded, shown as mannequins: canonical, or those of a clip, a
+    preset or a rig file."""
     prior: options.Prior = "locomotion-live"
     seed: options.Count = 0
     """Seed of the first poses, and of what is drawn for walks."""
@@ -91,18 +87,17 @@ def _open_app(command: Live, receiver: "OscReceiver | None", opened: ExitStack) 
     from scenes.live.app import LiveApp
     from scenes.live.character import CharacterLook
 
-    prior, drawn = priors.load(command.prior), _read_drawn(command)
+    prior, drawn = priors.load(command.prior), read_drawn_character(command.character)
     checkpoints.note_use(_STITCHER)  # the characters' processes load it
-    bodies, licence = _read_bodies(command, drawn), outputs.format_used_licences()
-    rigs = _choose_recorded_rigs(command, drawn, bodies)
-    looks = [CharacterLook(*one, licence) for one in zip(drawn, rigs, strict=True)]
-    characters = _start_characters(command, bodies, opened)
-    stream = streaming.open_stream(command, [character.skeleton for character in characters])
+    body = read_character(command.rig, command) if drawn is None else as_character(drawn.body)
+    look = CharacterLook(drawn, body.on_rig, outputs.format_used_licences())
+    characters = _start_characters(command, body, opened)
+    stream = streaming.open_stream(command, [body.skeleton] * len(characters))
     if stream is not None:
         opened.callback(stream.close)
     show = LiveApp(
         characters,
-        looks,
+        look,
         port=command.port,
         fastest=prior.limits.max_steering_speed,
         labels=prior.labels,
@@ -120,54 +115,26 @@ def _check(command: Live) -> None:
         raise RequestError(f"the port must be a number from 1 to 65535, got {command.port}")
     if not 1 <= command.characters <= _MAX_CHARACTERS:
         raise RequestError(f"--characters must be 1 to {_MAX_CHARACTERS}, got {command.characters}")
-    if len(command.character) > command.characters:
-        raise RequestError(
-            f"--character is given {len(command.character)} times for {command.characters} of --characters"
-        )
+    if command.character is not None and command.rig != "canonical":
+        raise RequestError("--character moves on its own bones; leave it or --rig out")
     for package in ("viser", "trimesh"):
         if find_spec(package) is None:
             raise RequestError(f"this needs the package {package}: pip install 'mapctl[live]'")
     streaming.check(command, command.listen, characters=command.characters)
 
 
-def _read_drawn(command: Live) -> list[DrawnCharacter | None]:
-    """Read the file of each character; those without one are mannequins."""
-    read = {file: read_drawn_character(file) for file in dict.fromkeys(command.character)}
-    files = [*command.character, *command.character[-1:] * (command.characters - len(command.character))]
-    return [read[file] for file in files] or [None] * command.characters
-
-
-def _read_bodies(command: Live, drawn: Sequence[DrawnCharacter | None]) -> list[Character]:
-    """Read the body of each character: of its own file, else of --rig."""
-    rig = read_character(command.rig, command)
-    return [rig if one is None else as_character(one.body) for one in drawn]
-
-
-def _choose_recorded_rigs(
-    command: Live, drawn: Sequence[DrawnCharacter | None], bodies: Sequence[Character]
-) -> list[Callable[[Motion], Motion] | None]:
-    """Choose for each character what puts its recording on --rig; None where it stays as it is."""
-    if command.rig == "canonical":
-        return [None] * len(bodies)
-    rig = read_rigged(command.rig, command)
-
-    def carry(motion: Motion) -> Motion:
-        return rig.on_rig(retarget_motion(motion, rig).motion)
-
-    return [body.on_rig if one is None else carry for one, body in zip(drawn, bodies, strict=True)]
-
-
-def _start_characters(command: Live, bodies: Sequence[Character], opened: ExitStack) -> Sequence[CharacterProcess]:
+def _start_characters(command: Live, body: Character, opened: ExitStack) -> Sequence[CharacterProcess]:
     """Start the characters side by side, all at once, and wait until they walk."""
+    settings = SteerSettings(liveliness=command.liveliness, footing=FootContact(rest_height=body.toe_rest_height))
     found: list[CharacterProcess] = []
-    for number, own in enumerate(bodies):
+    for number in range(command.characters):
         request = CharacterRequest(
             functools.partial(priors.load, priors.add_set(command.prior)),
             Command(1.2, 0.0),
             command.seed + number,
-            (_START_SPACING * (number - (len(bodies) - 1) / 2), 0.0),
-            SteerSettings(liveliness=command.liveliness, footing=FootContact(rest_height=own.toe_rest_height)),
-            own.skeleton,
+            (_START_SPACING * (number - (command.characters - 1) / 2), 0.0),
+            settings,
+            body.skeleton,
             transitions=functools.partial(priors.load_stitcher, priors.add_set(_STITCHER)),
         )
         found.append(opened.enter_context(CharacterProcess(request)))

@@ -22,8 +22,6 @@ class StreamStatistics:
     frames_sent: int = 0
     late: int = 0
     """Frames sent later after they were due than a frame may be."""
-    largest_gap_ms: float = 0.0
-    """Largest time between two frames of a character, pauses left out, milliseconds."""
     largest_lateness_ms: float = 0.0
     """Largest time from when a frame was due to when it was sent, milliseconds."""
     not_sent: int = 0
@@ -39,7 +37,6 @@ class _Post:
         self._socket.setblocking(False)
         self._waiting: list[tuple[float, int, int, Sequence[bytes]]] = []
         self._counter = itertools.count()
-        self._last_sent: dict[int, float] = {}
         self.statistics = StreamStatistics()
 
     def seconds_left(self) -> float | None:
@@ -55,10 +52,6 @@ class _Post:
     def forget(self, character: int) -> None:
         self._waiting = [frame for frame in self._waiting if frame[2] != character]
         heapq.heapify(self._waiting)
-        self._last_sent.pop(character, None)
-
-    def pause(self) -> None:
-        self._last_sent.clear()
 
     def send_due(self) -> None:
         """Send what is due now."""
@@ -70,17 +63,15 @@ class _Post:
             except OSError as error:  # nobody there, or no room: the next frame comes anyway
                 self._count_unsent(error.strerror or str(error))
             else:
-                self._count_sent(character, due, time.perf_counter())
+                self._count_sent(time.perf_counter() - due)
 
-    def _count_sent(self, character: int, due: float, now: float) -> None:
-        known, gap = self.statistics, now - self._last_sent.get(character, now)
-        self._last_sent[character] = now
+    def _count_sent(self, lateness: float) -> None:
+        known = self.statistics
         self.statistics = replace(
             known,
             frames_sent=known.frames_sent + 1,
-            late=known.late + (now - due > self._late_seconds),
-            largest_gap_ms=max(known.largest_gap_ms, 1000 * gap),
-            largest_lateness_ms=max(known.largest_lateness_ms, 1000 * (now - due)),
+            late=known.late + (lateness > self._late_seconds),
+            largest_lateness_ms=max(known.largest_lateness_ms, 1000 * lateness),
         )
 
     def _count_unsent(self, why: str) -> None:
@@ -110,7 +101,7 @@ def _obey(post: _Post, connection: Connection) -> bool:
         word, *content = connection.recv()
     except EOFError:
         return False
-    actions: dict[str, Any] = {"put": post.put, "forget": post.forget, "pause": post.pause}
+    actions: dict[str, Any] = {"put": post.put, "forget": post.forget}
     if word in actions:
         actions[word](*content)
     return word != "close"

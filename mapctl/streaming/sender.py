@@ -247,10 +247,6 @@ class PoseStream:
         """Send nothing of a character that has not been sent: it restarts."""
         self._queue.put(("forget", character))
 
-    def pause(self) -> None:
-        """Count the time until the next frames as a pause."""
-        self._queue.put(("pause",))
-
     def close(self) -> None:
         """Send what still waits, each frame at its time, and end."""
         self._queue.put(("close",))

@@ -14,11 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import viser
 
-from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import MapctlError, RequestError
 from scenes.live.camera import WorldView
 from scenes.live.character import CharacterLook, ShownCharacter
-from scenes.live.inputs import HELP, KEYS, Driving, InputLimits
+from scenes.live.inputs import HELP, KEYS, UNCONDITIONED, Driving
 from scenes.live.page import HOST, PageChannel, open_server
 from scenes.live.panel import Panel
 from scenes.live.paths import PathEditor, write_csv
@@ -46,7 +45,7 @@ class LiveApp:
     def __init__(
         self,
         characters: "Sequence[CharacterProcess]",
-        looks: Sequence[CharacterLook],
+        look: CharacterLook,
         *,
         port: int,
         fastest: float,
@@ -54,29 +53,28 @@ class LiveApp:
         stream: "PoseStream | None" = None,
         source: "OscReceiver | None" = None,
     ):
-        """Open the page. `looks` are by character; `fastest` is the prior's speed, m/s, and `labels` are its, by group.
+        """Open the page. `look` is that of all characters; `fastest` is the prior's speed, m/s, and `labels` are its
+        gaits and styles, by group.
 
         Frames also go to `stream`, and commands also come from `source`; the caller closes these.
         """
         self._channel, self._stream = PageChannel(KEYS, HELP), stream
         self.server = open_server(port, self._channel)
-        self.limits = InputLimits(math.floor(10 * fastest) / 10, labels)
+        self.fastest, self.labels = math.floor(10 * fastest) / 10, labels
         self.is_paused = False
         self._paused_at = self._began = 0.0
         self._queue: queue.SimpleQueue[Callable[[], Any]] = queue.SimpleQueue()
         self._noted: dict[str, float] = {}
         scene = self.server.scene
         self.view = WorldView(self.server, characters=len(characters))
-        self.characters = [
-            ShownCharacter(scene, number, *one) for number, one in enumerate(zip(characters, looks, strict=True))
-        ]
+        self.characters = [ShownCharacter(scene, number, one, look) for number, one in enumerate(characters)]
         self.chosen = self.characters[0]
         self.targets = LiveTargets(self)
         self.path = PathEditor(self)
         self.recorder = Recorder(self.server, self.notify)
         self.timeline = Timeline(self.characters, self._set_paused)
         self.panel = Panel(self.server.gui, self, characters=len(characters))
-        self.panel.show_inputs(self.chosen.inputs)
+        self.panel.show_command(self.chosen.wanted)
         self.driving = Driving(self)
         self._lock: float | None = None
         self._remote = None if source is None else RemoteCommands(source, self)
@@ -98,7 +96,7 @@ class LiveApp:
             with self.server.atomic():
                 self._run_safely(lambda now=now: self._step(now))
             if ticks % _HOUSEKEEPING_TICKS == 0:
-                self._run_safely(lambda: self.panel.show_state(self.chosen, self.recorder, self.timeline))
+                self._run_safely(lambda: self.panel.show_state(self.chosen, self.timeline))
             ticks += 1
             time.sleep(max(0.0, _TICK - (time.perf_counter() - now)))
 
@@ -141,36 +139,37 @@ class LiveApp:
 
     # Steering
 
-    def change(self, character: ShownCharacter, changes: Mapping[str, Any]) -> list[str]:
-        """Change a character's inputs by name, within the limits, and have it obey; it leaves its path. Returns what
-        could not be done as it was asked."""
-        notes = self._apply(character, changes)
-        self._show_inputs(character)
+    def change(self, character: ShownCharacter, **changes: Any) -> list[str]:
+        """Change fields of a character's command, within what the prior can do, and have it obey; it leaves its path.
+        Returns a sentence for each value that was limited; RequestError for values that are none."""
+        notes = self._obey(character, changes)
+        self._show_command(character)
         return notes
 
     def change_from_panel(self, **changes: Any) -> None:
-        """Change the chosen character's inputs from a control, which may still be typed into and keeps its text."""
-        self._apply(self.chosen, changes)
-        if "speed" in changes and self.chosen.inputs.speed > 0:
-            self.driving.walk_speed = self.chosen.inputs.speed
-        self.panel.enable(self.chosen.inputs)
+        """Change the chosen character's command from a control, which may still be typed into and keeps its text."""
+        for note in self._obey(self.chosen, changes):
+            self.notify("Limited", note)
+        if "speed" in changes and self.chosen.wanted.speed > 0:
+            self.driving.walk_speed = self.chosen.wanted.speed
+
+    def label(self, character: ShownCharacter, group: str, label: str) -> None:
+        """Have a character move in a gait or style, as the group may be; UNCONDITIONED leaves it to the prior."""
+        if label not in (UNCONDITIONED, *self.labels[group]):
+            raise RequestError(f"{label!r} is not a {group} of this prior")
+        others = tuple(one for one in character.wanted.labels if not one.startswith(f"{group}="))
+        self.change(character, labels=others if label == UNCONDITIONED else (*others, f"{group}={label}"))
 
     def aim(self, character: ShownCharacter, **changes: Any) -> None:
         """Have a character reach for other targets (`reach`) or look at another (`look_at`)."""
-        character.inputs = replace(character.inputs, **changes)
-        character.aim(self.targets.obstacles)
-        self._show_inputs(character)
-
-    def set_disc(self, disc: Obstacle | None) -> None:
-        """Have all characters walk round a disc, or round nothing."""
-        self.targets.set_disc(disc)
-        self.panel.disc.value = disc is not None
+        character.aim(replace(character.wanted, **changes))
+        self._show_command(character)
 
     def choose(self, number: int) -> None:
-        """Choose the character, from 0, whose inputs are shown and changed from now on."""
+        """Choose the character, from 0, whose command is shown and changed from now on."""
         self.chosen = self.characters[number]
         self.view.chase.switch(self.chosen.position)
-        self._show_inputs(self.chosen)
+        self._show_command(self.chosen)
 
     def set_paused(self, paused: bool) -> None:
         """Stop all characters, or let them go on, which shows the present."""
@@ -179,17 +178,18 @@ class LiveApp:
         self._set_paused(paused)
 
     def restart(self) -> None:
-        """Restart all characters with their first inputs."""
+        """Restart all characters with their first command."""
         self.timeline.return_to_present()
         for number, character in enumerate(self.characters):
-            self._run_safely(lambda one=character: one.reset(self.targets.obstacles))
+            self._run_safely(lambda one=character: one.reset())
             if self._stream is not None:
                 self._stream.forget(number)
-        self._show_inputs(self.chosen)
+        self._show_command(self.chosen)
 
-    def walk(self, character: ShownCharacter, points: Sequence[tuple[float, float]], *, closed: bool = False) -> None:
-        """Have a character walk along points, x and z in metres. RequestError where they make no path."""
-        character.character.walk(list(points), character.inputs.speed or _DEFAULT_SPEED, closed=closed)
+    def walk_path(self) -> None:
+        """Have the chosen character walk along the path. RequestError where its points make none."""
+        path, speed = self.path, self.chosen.wanted.speed or _DEFAULT_SPEED
+        self.chosen.character.walk(list(path.points), speed, closed=path.is_closed)
 
     def click(self, ray_origin: Any, ray_direction: Any) -> None:
         """Send the chosen character where a click meets the ground, or add a point to the path there."""
@@ -199,8 +199,8 @@ class LiveApp:
         if journey is not None:
             within, facing, stands = journey
             if stands:
-                self.change(self.chosen, {"speed": 0.0})
-            self.targets.go(self.chosen, point, within, None if facing is None else math.radians(facing))
+                self.change(self.chosen, speed=0.0)
+            self.targets.go(self.chosen, point, within, facing)
         elif self.panel.draw.value is True:
             self.path.add(point)
 
@@ -243,15 +243,14 @@ class LiveApp:
             for note in chunk.notes:
                 self.notify(character.name, note)
 
-    def _apply(self, character: ShownCharacter, changes: Mapping[str, Any]) -> list[str]:
-        character.inputs, notes = self.limits.change(character.inputs, changes)
-        self.panel.refusal.content = "\n\n".join(f"⚠️ {note}" for note in notes)
-        character.command(self.targets.obstacles)
+    def _obey(self, character: ShownCharacter, changes: Mapping[str, Any]) -> list[str]:
+        command, notes = replace(character.wanted, **changes).within(self.fastest)
+        character.command(command)
         return notes
 
-    def _show_inputs(self, character: ShownCharacter) -> None:
+    def _show_command(self, character: ShownCharacter) -> None:
         if character is self.chosen:
-            self.panel.show_inputs(character.inputs)
+            self.panel.show_command(character.wanted)
             self.targets.show()
 
     def show_path(self, text: str) -> None:
@@ -265,32 +264,29 @@ class LiveApp:
         now, self.is_paused = time.perf_counter(), paused
         self.panel.paused.label = "Resume" if paused else "Pause"
         seconds, self._paused_at = 0.0 if paused else now - self._paused_at, now
-        if self._stream is not None:
-            self._stream.pause()
         for character in self.characters:
             self._run_safely(lambda one=character: one.pause(paused, seconds))
 
     def steer(self, speed: float, heading: float | None, facing: float | None) -> None:
-        """Steer the chosen character at a speed, m/s; headings in degrees, None keeps or frees them."""
-        kept = {} if heading is None else {"heading": heading}
-        self.change(self.chosen, {"speed": speed, "facing": facing} | kept)
+        """Steer the chosen character at a speed, m/s; headings in radians, None keeps or frees them."""
+        heading = self.chosen.wanted.heading if heading is None else heading
+        self.change(self.chosen, speed=speed, heading=heading, facing=facing)
 
     def find_lock(self) -> float | None:
-        """Return the locked facing of the chosen character, degrees: toward its target where there is one."""
-        inputs, position = self.chosen.inputs, self.chosen.position
-        target = inputs.look_at or next(iter(inputs.reach.values()), None)
+        """Return the locked facing of the chosen character, radians: toward its target where there is one."""
+        target, position = self.targets.point, self.chosen.position
         if self._lock is None or target is None:
             return self._lock
-        return math.degrees(math.atan2(target[0] - position[0], target[2] - position[1]))
+        return math.atan2(target[0] - position[0], target[2] - position[1])
 
     def _toggle_lock(self) -> None:
         self._lock = self.view.find_heading((0.0, 1.0), None) if self._lock is None else None
-        self.change(self.chosen, {"facing": self.find_lock()})
+        self.change(self.chosen, facing=self.find_lock())
 
     def act(self, key: str) -> None:
         """Do what a key of ACTIONS does."""
         actions: dict[str, Callable[[], Any]] = {
-            "KeyX": lambda: self.change(self.chosen, {"speed": 0.0}),
+            "KeyX": lambda: self.change(self.chosen, speed=0.0),
             "KeyL": self._toggle_lock,
             "KeyP": lambda: self.set_paused(not self.is_paused),
             "KeyR": self.restart,

@@ -144,14 +144,14 @@ class WorldView:
                 client.camera.position, client.camera.look_at = frame_characters(shown, client.camera.aspect)
 
     def find_heading(self, direction: tuple[float, float], viewer: int | None) -> float:
-        """Return the heading in the world, degrees, of a direction to the right and away as a browser's camera sees it;
+        """Return the heading in the world, radians, of a direction to the right and away as a browser's camera sees it;
         as the first browser's where that one is unknown."""
         clients = self._server.get_clients()
         client = clients.get(-1 if viewer is None else viewer, next(iter(clients.values()), None))
         camera = self._server.initial_camera if client is None else client.camera
         look, (right, away) = np.asarray(camera.look_at) - np.asarray(camera.position), direction
         x, _, z = turn_about_up(np.array([-right, 0.0, away]), math.atan2(look[0], look[2]) + self.chase.yaw)
-        return math.degrees(math.atan2(x, z))
+        return math.atan2(x, z)
 
     def find_ground(self, origin: Any, direction: Any) -> tuple[float, float] | None:
         """Return x and z in the world where a ray as a browser sent it meets the ground; None where it does not within

@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -12,9 +12,9 @@ import torch
 import viser
 
 from mapctl import kinematics, rotations
-from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import MapctlError
 from mapctl.features import PRIOR_FPS
+from mapctl.intent.steering import Command
 from mapctl.mesh import colours
 from mapctl.mesh.character_mesh import CharacterMesh
 from mapctl.mesh.mannequin import at_rest, build_skin
@@ -25,7 +25,6 @@ from mapctl.runtime.live_protocol import FrameChunk
 from mapctl.skeleton import TOE_JOINTS
 from scenes.drawn_character import DrawnCharacter
 from scenes.live.camera import WORLD, to_rgb_bytes
-from scenes.live.inputs import SteeringInputs
 
 if TYPE_CHECKING:
     from controllers.steering.process import CharacterProcess
@@ -37,6 +36,7 @@ _TRAIL_POINTS, _RESET_METRES = 24, 0.5  # of a band on the ground; a step of the
 _FAR = 1e4  # metres
 _MARK_HEIGHT, _FOOT_RADIUS = 0.012, 0.12  # metres over the ground, and of a planted foot's disc
 _MAX_COLOURS = 12  # of a character's mesh
+_FIRST_SPEED = 1.2  # m/s
 _OPAQUE = 0.999
 
 Pose = tuple[Array, Array]
@@ -200,23 +200,24 @@ class DueFrame:
 
 @dataclass(frozen=True)
 class CharacterLook:
-    """How a character is shown and recorded."""
+    """How characters are shown and recorded."""
 
     drawn: DrawnCharacter | None = None
     """Mesh of its own; a mannequin without one."""
-    on_rig: Callable[[Motion], Motion] | None = None
-    """Puts its motion on the joints on which it is recorded, if these are others than those of the drawn character."""
+    on_rig: Callable[[Motion], Motion] = lambda motion: motion
+    """Puts its motion on the joints on which it is recorded."""
     licence: str = ""
     """Licence of its recordings."""
 
 
 class ShownCharacter:
-    """A live character with its inputs and all that the browser shows of it."""
+    """A live character with its command and all that the browser shows of it."""
 
     def __init__(self, scene: viser.SceneApi, number: int, character: "CharacterProcess", look: CharacterLook):
         """Set up character `number`, from 0, with its nodes."""
         self.name, self.character, self.look = f"Character {number + 1}", character, look
-        self.inputs = SteeringInputs()
+        self.wanted = Command(_FIRST_SPEED, 0.0)
+        """Its command."""
         self.recorded: list[FrameChunk] | None = None
         """Frames since its recording began; None while it is not recorded."""
         self.ended = ""
@@ -236,20 +237,22 @@ class ShownCharacter:
         self._waiting: deque[DueFrame] = deque()
         self._shown: DueFrame | None = None
 
-    def command(self, obstacles: Sequence[Obstacle]) -> None:
-        """Send the character its inputs; it leaves its path."""
-        self.character.command(replace(self.inputs.command, obstacles=tuple(obstacles)))
+    def command(self, command: Command) -> None:
+        """Have the character obey a command; it leaves its path."""
+        self.wanted = command
+        self.character.command(command)
 
-    def aim(self, obstacles: Sequence[Obstacle]) -> None:
-        """Send the character its targets and obstacles alone; it keeps its path."""
-        self.character.aim(replace(self.inputs.command, obstacles=tuple(obstacles)))
+    def aim(self, command: Command) -> None:
+        """Give the character the targets and obstacles of a command alone; it keeps its path."""
+        self.wanted = command
+        self.character.aim(command)
 
-    def reset(self, obstacles: Sequence[Obstacle]) -> None:
-        """Restart with the first inputs; a recording goes on."""
+    def reset(self) -> None:
+        """Restart with the first command; a recording goes on."""
         self._waiting.clear()
-        self.inputs, self.ended, self._shown = SteeringInputs(), "", None
+        self.ended, self._shown = "", None
         self.frames = self.late_frames = 0
-        self.command(obstacles)
+        self.command(Command(_FIRST_SPEED, 0.0, obstacles=self.wanted.obstacles))
         self.character.reset()
 
     def pause(self, paused: bool, seconds: float = 0.0) -> None:

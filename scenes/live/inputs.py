@@ -1,14 +1,11 @@
-"""Inputs of one character: what it is requested and its limits, and the held keys and sticks that change it."""
+"""Held keys and sticks, which steer the chosen character, and limits of what users and programs send."""
 
 import math
-from collections.abc import Mapping, Sequence, Set
-from dataclasses import dataclass, field, replace
+from collections.abc import Set
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from mapctl.intent.steering import STEP_LENGTHS, Command
-from mapctl.streaming.messages import is_number
+from mapctl.arguments import read_number, read_point
+from mapctl.errors import RequestError
 from scenes.live.page import PageState
 
 if TYPE_CHECKING:
@@ -16,99 +13,25 @@ if TYPE_CHECKING:
 
 UNCONDITIONED = "any"
 """The choice that gives a prior no label."""
-HANDS = ("left", "right")
 DISC_RADII = (0.2, 2.0)
 """Smallest and largest disc to walk round, metres."""
 WITHIN = (0.5, 10.0)
 """Shortest and longest time in which a character can be sent to a position, seconds."""
 Point = tuple[float, float, float]
 _MAX_COORDINATE = 1e4  # metres from the origin
-_UNITS = {"speed": "m/s", "step_length": "m", "heading": "degrees", "facing": "degrees"}
 
 
-@dataclass(frozen=True)
-class SteeringInputs:
-    """Request of one character, as the panel shows it."""
-
-    speed: float = 1.2
-    """Speed, m/s."""
-    heading: float = 0.0
-    """Direction of travel, degrees; 0 is +Z, 90 is +X."""
-    facing: float | None = None
-    """Facing, degrees; None faces the direction of travel."""
-    step_length: float | None = None
-    """Step length, metres; None leaves it to the prior."""
-    labels: Mapping[str, str] = field(default_factory=dict)
-    """Chosen label by group (gait, style)."""
-    reach: Mapping[str, Point] = field(default_factory=dict)
-    """Targets of hands in the world, metres, by `left` and `right`."""
-    look_at: Point | None = None
-    """Target of the head in the world, metres."""
-
-    @property
-    def command(self) -> Command:
-        """Command for the character."""
-        return Command(
-            self.speed,
-            math.radians(self.heading),
-            None if self.facing is None else math.radians(self.facing),
-            step_length=self.step_length,
-            labels=tuple(f"{group}={label}" for group, label in self.labels.items()),
-            reach={f"{hand}Hand": point for hand, point in self.reach.items()},
-            look_at=self.look_at,
-        )
+def read_position(values: Any) -> Point:
+    """Return a position that a browser or another program sent, metres; RequestError unless it is finite and near."""
+    x, y, z = read_point(values, 3, "a position")
+    if max(abs(x), abs(y), abs(z)) > _MAX_COORDINATE:
+        raise RequestError(f"a position must be within {_MAX_COORDINATE:g} m of the origin")
+    return x, y, z
 
 
-@dataclass(frozen=True)
-class InputLimits:
-    """Limits of what can be asked of a prior."""
-
-    fastest: float
-    """Fastest speed, m/s."""
-    labels: Mapping[str, Sequence[str]]
-    """Labels of the prior, by group."""
-
-    def change(self, inputs: SteeringInputs, changes: Mapping[str, Any]) -> tuple[SteeringInputs, list[str]]:
-        """Change inputs by name, each limited to what is possible; also return a sentence for each that was limited.
-
-        A value that is not a finite number changes nothing. `labels` holds a label by group, UNCONDITIONED for none.
-        """
-        found, notes, ranges = {}, list[str](), {"speed": (0.0, self.fastest), "step_length": STEP_LENGTHS}
-        for name, value in changes.items():
-            words = name.replace("_", " ")
-            if name == "labels":
-                wrong = {
-                    group: label
-                    for group, label in value.items()
-                    if group not in self.labels or label not in (UNCONDITIONED, *self.labels[group])
-                }
-                chosen = {**inputs.labels, **{g: label for g, label in value.items() if g not in wrong}}
-                found[name] = {group: label for group, label in chosen.items() if label != UNCONDITIONED}
-                notes += [f"{label!r} is not a {group} of this prior." for group, label in wrong.items()]
-            elif value is None and name in ("facing", "step_length"):
-                found[name] = None
-            elif value is None or not is_number(value):
-                notes.append(f"{str(value)[:20]!r} is not a {words} in {_UNITS[name]}.")
-            elif name in ("heading", "facing"):
-                found[name] = math.remainder(value, 360)
-            else:
-                low, high = ranges[name]
-                found[name] = min(high, max(low, float(value)))
-                if found[name] != value:
-                    unit = _UNITS[name]
-                    notes.append(f"A {words} of {value:g} {unit} is out of range: {low:g} to {high:g} {unit}.")
-        return replace(inputs, **found), notes
-
-
-def parse_point(value: object) -> Point | None:
-    """Return a position that a browser or another program sent, metres; None unless it is finite and near."""
-    try:
-        found = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        return None
-    if found.shape != (3,) or not np.isfinite(found).all() or np.abs(found).max() > _MAX_COORDINATE:
-        return None
-    return float(found[0]), float(found[1]), float(found[2])
+def read_degrees(value: Any) -> float:
+    """Return an angle that a browser or another program sent in degrees, radians, within half a turn."""
+    return math.radians(math.remainder(read_number(value, "an angle"), 360))
 
 
 ACTIONS = {
@@ -143,9 +66,10 @@ HELP = (
 """Keys and what they do, as the page lists them."""
 
 _DEAD, _FULL = 0.18, 0.95  # shares of a stick's travel that count as none and as all
-_ORDER_SECONDS, _LEAST_TURN, _LEAST_SPEED = 0.1, 2.0, 0.05  # between inputs; degrees and m/s that make another one
+_ORDER_SECONDS, _LEAST_SPEED = 0.1, 0.05  # between orders; m/s that make another one
+_LEAST_TURN = math.radians(2.0)  # that makes another one
 Steering = tuple[float, float | None, float | None]
-"""Speed, m/s, heading and facing, degrees; None keeps the heading, and faces the direction of travel."""
+"""Speed, m/s, heading and facing, radians; None keeps the heading, and faces the direction of travel."""
 
 
 class Driving:
@@ -154,12 +78,12 @@ class Driving:
 
     def __init__(self, app: "LiveApp"):
         self._app = app
-        self.walk_speed = min(1.2, app.limits.fastest)
+        self.walk_speed = min(1.2, app.fastest)
         """Speed of a held key, m/s; Shift runs."""
         self._pages: dict[int, PageState] = {}
         self._given: Steering | None = None
         self._given_at = -math.inf
-        self._kept: float | None = None  # facing while it strafes, degrees
+        self._kept: float | None = None  # facing while it strafes, radians
 
     def update(self, page: int, state: PageState | None) -> None:
         """Take the state of a page; None if it is gone."""
@@ -185,7 +109,7 @@ class Driving:
 
     def _read(self, page: PageState) -> Steering | None:
         """Return what a page asks for; None where it asks for nothing."""
-        run_speed = max(self.walk_speed, 0.75 * self._app.limits.fastest)
+        run_speed = max(self.walk_speed, 0.75 * self._app.fastest)
         direction, speed = find_direction(page.keys), run_speed if page.keys & FAST else self.walk_speed
         if page.stick is not None and (pushed := _push(page.stick)) is not None:
             direction, push = pushed
@@ -197,7 +121,7 @@ class Driving:
         elif direction is not None and (locked := self._app.find_lock()) is not None:
             facing = locked
         elif page.keys & STRAFE:
-            self._kept = facing = math.degrees(self._app.chosen.facing) if self._kept is None else self._kept
+            self._kept = facing = self._app.chosen.facing if self._kept is None else self._kept
         if direction is None:
             return None if facing is None else (0.0, None, facing)
         return speed, self._app.view.find_heading(direction, page.viewer), facing
@@ -214,7 +138,7 @@ def _push(stick: tuple[float, ...] | None) -> tuple[tuple[float, float], float] 
 def _differ(one: Steering, other: Steering) -> bool:
     """Return whether two requests differ by more than the camera's sway."""
     turned = [
-        a is not b if a is None or b is None else abs(math.remainder(a - b, 360)) >= _LEAST_TURN
+        a is not b if a is None or b is None else abs(math.remainder(a - b, math.tau)) >= _LEAST_TURN
         for a, b in zip(one[1:], other[1:], strict=True)
     ]
     return any(turned) or abs(one[0] - other[0]) >= _LEAST_SPEED

@@ -1,18 +1,19 @@
 """The panel: status, and controls in tabs. What a user does runs on the loop's thread; the panel decides nothing."""
 
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import viser
 
+from mapctl.arguments import read_number
 from mapctl.features import PRIOR_FPS
-from mapctl.intent.steering import STEP_LENGTHS
-from mapctl.streaming.messages import is_number
+from mapctl.intent.steering import REACHING_HANDS, Command
 from scenes.live import paths
 from scenes.live.camera import CameraMode
 from scenes.live.character import KEPT_SECONDS, ShownCharacter
-from scenes.live.inputs import DISC_RADII, HANDS, UNCONDITIONED, WITHIN, SteeringInputs
-from scenes.live.recording import FORMATS, Recorder, Timeline
+from scenes.live.inputs import DISC_RADII, UNCONDITIONED, WITHIN, read_degrees
+from scenes.live.recording import FORMATS, Timeline
 
 if TYPE_CHECKING:
     from scenes.live.app import LiveApp
@@ -48,27 +49,23 @@ class Panel:
                 add()
 
     def _add_steering(self) -> None:
-        gui, limits, change = self._gui, self._app.limits, self._app.change_from_panel
-        self.speed = gui.add_slider("Speed, m/s", 0.0, limits.fastest, 0.1, min(1.2, limits.fastest))
+        gui, app, change = self._gui, self._app, self._app.change_from_panel
+        self.speed = gui.add_slider("Speed, m/s", 0.0, app.fastest, 0.1, min(1.2, app.fastest))
         # Floats throughout: a browser's 1e300 as an int could not be sent on, and would end all connections.
         self.heading = gui.add_slider("Heading, degrees", -180.0, 180.0, 1.0, 0.0, hint="0 is +Z, 90 is +X")
         self.strafe = gui.add_checkbox("Face a fixed direction", False)
-        self.facing = gui.add_slider("Facing, degrees", -180.0, 180.0, 1.0, 0.0, disabled=True)
-        self.measured = gui.add_checkbox("Measured steps", False)
-        self.step_length = gui.add_slider("Step length, m", *STEP_LENGTHS, 0.05, 0.65, disabled=True)
+        self.facing = gui.add_slider("Facing, degrees", -180.0, 180.0, 1.0, 0.0)
         self.labels = {
-            group: gui.add_dropdown(group.capitalize(), [UNCONDITIONED, *names])
-            for group, names in limits.labels.items()
+            group: gui.add_dropdown(group.capitalize(), [UNCONDITIONED, *names]) for group, names in app.labels.items()
         }
-        self.refusal = gui.add_markdown("")
-        self._on_change(self.speed, lambda value: change(speed=value))
-        self._on_change(self.heading, lambda value: change(heading=value))
-        self._on_change(self.strafe, lambda value: change(facing=self.facing.value if value else None))
-        self._on_change(self.facing, lambda value: change(facing=value) if self.strafe.value else None)
-        self._on_change(self.measured, lambda value: change(step_length=self.step_length.value if value else None))
-        self._on_change(self.step_length, lambda value: change(step_length=value) if self.measured.value else None)
+        self._on_change(self.speed, lambda value: change(speed=read_number(value, "the speed")))
+        self._on_change(self.heading, lambda value: change(heading=read_degrees(value)))
+        self._on_change(self.strafe, lambda value: change(facing=read_degrees(self.facing.value) if value else None))
+        self._on_change(
+            self.facing, lambda value: change(facing=read_degrees(value)) if self.strafe.value is True else None
+        )
         for group, handle in self.labels.items():
-            self._on_change(handle, lambda value, of=group: change(labels={of: value}))
+            self._on_change(handle, lambda value, of=group: app.label(app.chosen, of, value))
 
     def _add_path(self) -> None:
         gui, app, path = self._gui, self._app, self._app.path
@@ -76,8 +73,7 @@ class Panel:
         self.closed = gui.add_checkbox("Closed to a loop", False, hint="a closed path is walked again and again")
         self.path = gui.add_markdown(paths.HELP)
         self._on_change(self.closed, lambda value: path.edit(path.points, closed=value is True))
-        walk = self._add_button("Walk it", lambda client: app.walk(app.chosen, path.points, closed=path.is_closed))
-        walk.icon = viser.Icon.ROUTE
+        self._add_button("Walk it", lambda client: app.walk_path(), icon=viser.Icon.ROUTE)
         self._add_button("Clear", lambda client: path.edit([]), icon=viser.Icon.ERASER)
         hint = "x,z in metres, as mapctl follow reads it"
         self._add_button("Download CSV", app.download_path, icon=viser.Icon.DOWNLOAD, hint=hint)
@@ -96,11 +92,11 @@ class Panel:
 
     def _add_targets(self) -> None:
         gui, targets = self._gui, self._app.targets
-        self.hand = gui.add_dropdown("Hand", [_NO_HAND, *HANDS], hint="drag the ball that it reaches for")
+        self.hand = gui.add_dropdown("Hand", [_NO_HAND, *REACHING_HANDS], hint="drag the ball that it reaches for")
         self.looks = gui.add_checkbox("Look at it", False)
         self.disc = gui.add_checkbox("Disc to walk round", False, hint="drag it to where it is to be")
         self.radius = gui.add_slider("Radius, m", *DISC_RADII, 0.1, 0.5)
-        self._on_change(self.hand, lambda value: targets.reach(value if value in HANDS else None))
+        self._on_change(self.hand, lambda value: targets.reach(value if value in REACHING_HANDS else None))
         self._on_change(self.looks, lambda value: targets.look(value is True))
         self._on_change(self.disc, lambda value: targets.put_disc(self.radius.value if value else None))
         self._on_change(self.radius, lambda value: targets.put_disc(value) if self.disc.value else None)
@@ -116,15 +112,13 @@ class Panel:
             icon=viser.Icon.PLAYER_RECORD,
         )
         self.recorded = gui.add_markdown("")
-        again = self._add_button("Save again", lambda client: recorder.save_last(self.ending.value, client))
-        again.icon = viser.Icon.DOWNLOAD
         hint = "the characters stop while you look at the past"
         self.back = gui.add_slider("Look back, s", -KEPT_SECONDS, 0.0, 0.1, 0.0, hint=hint)
         self.timeline = gui.add_markdown("")
         self._on_change(self.back, lambda value: timeline.look_back(-value))
         self._add_button("Replay", lambda client: timeline.replay(), icon=viser.Icon.PLAYER_PLAY)
-        live = self._add_button("Back to live", lambda client: timeline.return_to_present())
-        live.icon = viser.Icon.PLAYER_TRACK_NEXT
+        back = viser.Icon.PLAYER_TRACK_NEXT
+        self._add_button("Back to live", lambda client: timeline.return_to_present(), icon=back)
 
     def _add_view(self) -> None:
         gui, app = self._gui, self._app
@@ -135,40 +129,32 @@ class Panel:
         gui.add_markdown(_LEGEND)
 
     def read_journey(self) -> tuple[float, float | None, bool] | None:
-        """Return seconds, facing (degrees) and whether to stand there, if a click on the ground sends the character;
+        """Return seconds, facing (radians) and whether to stand there, if a click on the ground sends the character;
         None otherwise."""
-        within, facing = self.within.value, self.turn.value if self.turns.value is True else None
-        if self.go.value is not True or not is_number(within) or not (facing is None or is_number(facing)):
+        if self.go.value is not True:
             return None
-        return min(WITHIN[1], max(WITHIN[0], within)), facing, self.then.value == _STAND
+        facing = read_degrees(self.turn.value) if self.turns.value is True else None
+        return read_number(self.within.value, "the time"), facing, self.then.value == _STAND
 
-    def show_inputs(self, inputs: SteeringInputs) -> None:
-        """Show inputs in the controls, without sending them again."""
-        self.speed.value, self.heading.value = inputs.speed, round(inputs.heading)
-        self.strafe.value, self.measured.value = inputs.facing is not None, inputs.step_length is not None
-        if inputs.facing is not None:
-            self.facing.value = round(inputs.facing)
-        if inputs.step_length is not None:
-            self.step_length.value = inputs.step_length
+    def show_command(self, command: Command) -> None:
+        """Show a command in the controls, without sending it again."""
+        self.speed.value, self.heading.value = command.speed, round(math.degrees(command.heading))
+        self.strafe.value = command.facing is not None
+        if command.facing is not None:
+            self.facing.value = round(math.degrees(command.facing))
+        chosen = dict(label.split("=", 1) for label in command.labels)
         for group, handle in self.labels.items():
-            handle.value = inputs.labels.get(group, UNCONDITIONED)
-        self.hand.value = next(iter(inputs.reach), _NO_HAND)
-        self.looks.value = inputs.look_at is not None
-        self.enable(inputs)
+            handle.value = chosen.get(group, UNCONDITIONED)
+        self.hand.value = next(iter(command.reach), _NO_HAND)
+        self.looks.value = command.look_at is not None
 
-    def enable(self, inputs: SteeringInputs) -> None:
-        """Enable the controls that have an effect."""
-        self.facing.disabled, self.step_length.disabled = inputs.facing is None, inputs.step_length is None
-
-    def show_state(self, character: ShownCharacter, recorder: Recorder, timeline: Timeline) -> None:
+    def show_state(self, character: ShownCharacter, timeline: Timeline) -> None:
         """Bring all texts up to date; a few times a second is enough."""
         recorded, back = character.recorded, -round(timeline.seconds_back or 0.0, 1)
         self.status.content = character.describe_status()
         self.record.label = "Record" if recorded is None else "Stop and save"
-        if recorded is not None:
-            self.recorded.content = f"● **{sum(len(chunk.root) for chunk in recorded) / PRIOR_FPS:.1f} s**"
-        else:
-            self.recorded.content = "" if recorder.last is None else f"Last: {recorder.last.seconds:.1f} s"
+        seconds = sum(len(chunk.root) for chunk in recorded or ()) / PRIOR_FPS
+        self.recorded.content = "" if recorded is None else f"● **{seconds:.1f} s**"
         self.timeline.content = timeline.describe()
         if abs(self.back.value - back) > 0.05:
             self.back.value = back

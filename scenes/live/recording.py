@@ -1,4 +1,4 @@
-"""The past of live characters: the last two minutes, shown again and replayed; recordings, and the files of them."""
+"""The past of live characters: the last two minutes, shown again and replayed, and recordings."""
 
 import itertools
 import tempfile
@@ -25,32 +25,22 @@ FORMATS = ("bvh", "glb", "npz")
 
 
 class Recorder:
-    """Recordings of characters; the last one is kept, so that a file of another format can be written of it."""
+    """Recordings of characters."""
 
     def __init__(self, server: viser.ViserServer, notify: Callable[[str, str], None]):
         """Files go to browsers of `server`; `notify` shows a note: title and text."""
         self._server, self._notify = server, notify
         self._pool = ThreadPoolExecutor(1)  # a long recording takes seconds
         self._saved: Future[None] | None = None
-        self.last: Motion | None = None
-        """Last recording."""
 
     def toggle(self, character: ShownCharacter, ending: str, client: viser.ClientHandle | None) -> None:
-        """Begin to record a character, or end and give the browser a file of this ending. RequestError without
-        frames."""
+        """Begin to record a character, or end and give the browser a file of this ending; write it into the current
+        folder where that browser is gone. RequestError without frames."""
         if character.recorded is None:
             character.recorded = []
             return
         chunks, character.recorded = character.recorded, None
-        self.last = join_chunks(character, chunks)
-        self.save_last(ending, client)
-
-    def save_last(self, ending: str, client: viser.ClientHandle | None) -> None:
-        """Give a browser the last recording as a file of this ending; write it into the current folder where that
-        browser is gone. RequestError where there is none."""
-        if self.last is None:
-            raise RequestError("nothing was recorded yet")
-        self._saved = self._pool.submit(self._save, self.last, ending, client)
+        self._saved = self._pool.submit(self._save, join_chunks(character, chunks), ending, client)
 
     def wait(self) -> None:
         """Wait for the file that is being written."""
@@ -76,11 +66,7 @@ def join_chunks(character: ShownCharacter, chunks: Sequence[FrameChunk]) -> Moti
     quats = make_sign_continuous(torch.cat([piece.local_quat_xyzw for piece in pieces]))
     roots = torch.cat([piece.root_position for piece in pieces])
     motion = replace(pieces[0], root_position=roots, local_quat_xyzw=quats)
-    if look.on_rig is not None:
-        motion = look.on_rig(motion)
-    elif look.drawn is not None:
-        motion = look.drawn.put_on(motion).motion
-    return replace(motion, licence=look.licence)
+    return replace(look.on_rig(motion), licence=look.licence)
 
 
 def encode_motion(motion: Motion, ending: str) -> bytes:

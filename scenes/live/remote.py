@@ -7,13 +7,12 @@ import re
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from mapctl.curves.obstacles import Obstacle
 from mapctl.errors import MapctlError, RequestError
 from mapctl.streaming.messages import Message, is_number
 from scenes.live.character import ShownCharacter
-from scenes.live.inputs import DISC_RADII, WITHIN, parse_point
+from scenes.live.inputs import read_degrees, read_position
 
 if TYPE_CHECKING:  # python-osc may not be installed
     from mapctl.streaming.receiver import OscReceiver
@@ -23,20 +22,15 @@ _DEFAULT_WITHIN = 2.0  # seconds in which a character is sent to a position, unl
 _REPORT_SECONDS = 2.0  # between two lines on the console, however many commands there are
 _ADDRESS = re.compile(r"/mapctl(?:/(?P<character>\d{1,4}))?/(?P<name>[a-z][a-z_/]{0,30})")
 _SHOWN_LENGTH = 40  # characters of what a program sent that a message repeats
-_MAX_PATH_POINTS = 200
 
-_HANDS = {"hand/left": "left", "hand/right": "right"}  # orders that a hand obeys
+_HANDS = {"hand/left": "leftHand", "hand/right": "rightHand"}  # orders that a hand obeys
 _NUMBERS: Mapping[str, Sequence[int]] = {
     "speed": (1,),
     "heading": (1,),
     "facing": (0, 1),
-    "step_length": (0, 1),
-    "stop": (0,),
     **dict.fromkeys(_HANDS, (0, 3)),
     "look": (0, 3),
     "goto": (2, 3, 4),
-    "path": range(4, 2 * _MAX_PATH_POINTS + 1, 2),
-    "disc": (0, 3),
     "pause": (0, 1),
     "reset": (0,),
 }
@@ -91,18 +85,12 @@ def _read_word(shown: str, arguments: Sequence[object]) -> str:
 
 def _read_numbers(shown: str, counts: Sequence[int], arguments: Sequence[object]) -> tuple[float, ...]:
     if len(arguments) not in counts:
-        raise RequestError(f"{shown} takes {_describe_counts(counts)}, not {len(arguments)}")
+        words = " or ".join("no" if count == 0 else str(count) for count in counts)
+        raise RequestError(f"{shown} takes {words} number{'' if counts[-1] == 1 else 's'}, not {len(arguments)}")
     found = tuple(float(value) for value in arguments if is_number(value))  # pyright: ignore[reportArgumentType]
     if len(found) < len(arguments):
         raise RequestError(f"{shown} takes finite numbers, not {_shorten(arguments)}")
     return found
-
-
-def _describe_counts(counts: Sequence[int]) -> str:
-    if isinstance(counts, range):
-        return f"x and z of {counts.start // 2} to {counts[-1] // 2} points"
-    words = " or ".join("no" if count == 0 else str(count) for count in counts)
-    return f"{words} number{'' if counts[-1] == 1 else 's'}"
 
 
 def _shorten(value: object) -> str:
@@ -122,11 +110,11 @@ class RemoteCommands:
         found, notes, characters = list[Order](), list[str](), self._app.characters
         for message in self._source.poll():
             try:
-                found.append(read_order(message, characters=len(characters), groups=list(self._app.limits.labels)))
+                found.append(read_order(message, characters=len(characters), groups=self._app.labels))
             except RequestError as error:
                 notes.append(str(error))
         # What steers comes first, then where to go, which keeps the new speed.
-        for order in sorted(keep_latest(found), key=lambda order: order.name in ("goto", "path")):
+        for order in sorted(keep_latest(found), key=lambda order: order.name == "goto"):
             try:
                 notes += self._act(characters[order.character], order)
             except MapctlError as error:
@@ -141,54 +129,24 @@ class RemoteCommands:
     def _act(self, character: ShownCharacter, order: Order) -> list[str]:
         """Do what one order asks for; return what could not be done as it was asked."""
         app, numbers = self._app, order.numbers
-        first = numbers[0] if numbers else None
         match order.name:
             case "reset":
                 app.restart()
             case "pause":
-                app.set_paused(first != 0)
-            case "disc":
-                app.set_disc(_read_disc(numbers))
-            case "path":
-                app.walk(character, _read_points(numbers))
+                app.set_paused(numbers != (0.0,))
             case "goto":
-                asked = numbers[2] if len(numbers) > 2 else _DEFAULT_WITHIN
-                facing = math.radians(math.remainder(numbers[3], 360)) if len(numbers) > 3 else None
-                within = min(WITHIN[1], max(WITHIN[0], asked))
-                app.targets.go(character, _read_points(numbers[:2])[0], within, facing)
+                x, _, z = read_position((numbers[0], 0.0, numbers[1]))
+                within = numbers[2] if len(numbers) > 2 else _DEFAULT_WITHIN
+                app.targets.go(character, (x, z), within, read_degrees(numbers[3]) if len(numbers) > 3 else None)
             case "look":
-                app.aim(character, look_at=_read_position(order))
+                app.aim(character, look_at=read_position(numbers) if numbers else None)
             case "hand/left" | "hand/right":
-                reach = {**character.inputs.reach, _HANDS[order.name]: _read_position(order)}
-                app.aim(character, reach={hand: point for hand, point in reach.items() if point is not None})
-            case "stop":
-                return app.change(character, {"speed": 0.0})
-            case name if order.word is not None:
-                return app.change(character, {"labels": {name: order.word}})
-            case name:
-                return app.change(character, {name: first})
+                others = {hand: at for hand, at in character.wanted.reach.items() if hand != _HANDS[order.name]}
+                app.aim(character, reach=others | ({_HANDS[order.name]: read_position(numbers)} if numbers else {}))
+            case "speed":
+                return app.change(character, speed=numbers[0])
+            case "heading" | "facing":
+                return app.change(character, **{order.name: read_degrees(numbers[0]) if numbers else None})
+            case group:
+                app.label(character, group, order.word or "")
         return []
-
-
-def _read_position(order: Order) -> Any:
-    """Return a position in the world, metres; None without one."""
-    point = parse_point(order.numbers) if order.numbers else None
-    if order.numbers and point is None:
-        raise RequestError(f"{order.name}: the position is too far away")
-    return point
-
-
-def _read_points(numbers: Sequence[float]) -> list[tuple[float, float]]:
-    points = list(zip(numbers[::2], numbers[1::2], strict=True))
-    if any(parse_point((x, 0.0, z)) is None for x, z in points):
-        raise RequestError("the position is too far away")
-    return points
-
-
-def _read_disc(numbers: Sequence[float]) -> Obstacle | None:
-    if not numbers:
-        return None
-    x, z, radius = numbers
-    if not DISC_RADII[0] <= radius <= DISC_RADII[1] or parse_point((x, 0.0, z)) is None:
-        raise RequestError(f"disc: the radius must be {DISC_RADII[0]:g} to {DISC_RADII[1]:g} m, the position near")
-    return Obstacle((x, z), radius)

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from helpers import run as run_command
 from helpers import walk
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from stage import Actor, delivered, live_app, run
 
 from controllers.steering.process import CharacterProcess
@@ -53,11 +55,14 @@ def test_a_port_that_is_taken_is_named_and_another_one_serves(monkeypatch, capsy
 
 
 def test_inputs_go_to_the_chosen_character_alone_and_the_panel_shows_them(show, actors):
-    show.change(show.chosen, {"speed": 2.0, "heading": 90.0})
+    show.change(show.chosen, speed=2.0, heading=math.pi / 2)
     show.choose(1)
-    show.change(show.chosen, {"speed": 0.5, "facing": -90.0, "labels": {"gait": "walk", "style": "old"}})
+    show.change(show.chosen, speed=0.5, facing=-math.pi / 2)
+    show.label(show.chosen, "gait", "walk")
+    show.label(show.chosen, "style", "old")
     assert actors[0].heard == [("command", Command(2.0, math.pi / 2))]
-    assert actors[1].heard == [("command", Command(0.5, 0.0, -math.pi / 2, labels=("gait=walk", "style=old")))]
+    wanted = Command(0.5, 0.0, -math.pi / 2, labels=("gait=walk", "style=old"))
+    assert actors[1].heard[-1] == ("command", wanted)
     panel = show.panel
     assert (panel.speed.value, panel.facing.value, panel.labels["gait"].value) == (0.5, -90, "walk")
     show.choose(0)
@@ -71,7 +76,7 @@ def test_pause_and_reset_are_for_all_characters(show, actors):
     run(show, 2)
     assert show.chosen.past == []
     show.set_paused(False)
-    show.change(show.chosen, {"speed": 3.0})
+    show.change(show.chosen, speed=3.0)
     show.restart()
     for actor in actors:
         assert [word for word, *_ in actor.heard if word != "command"] == ["pause", "pause", "reset"]
@@ -107,7 +112,7 @@ def test_keys_and_sticks_reach_the_character(show, actors):
 
 
 def test_a_lock_faces_the_target_as_the_character_passes_it(show, actors):
-    show.change(show.chosen, {"speed": 1.0})
+    show.change(show.chosen, speed=1.0)
     show.targets.look(True)
     show.targets.move_target((3.0, 1.1, 0.0))
     show.chosen.position = np.array([0.0, 0.0])
@@ -140,10 +145,7 @@ def test_poses_are_shown_between_frames(show):
 def test_a_drawn_path_is_walked_and_a_missing_one_is_named(show, actors, capsys):
     run(show, 1)
 
-    def walk_path() -> None:
-        show.walk(show.chosen, show.path.points, closed=show.path.is_closed)
-
-    show.enqueue(walk_path)
+    show.enqueue(show.walk_path)
     run(show, 1)
     assert "Not done: a curve needs two points" in capsys.readouterr().err
     show.view.chase.mode = CameraMode.FREE
@@ -154,7 +156,7 @@ def test_a_drawn_path_is_walked_and_a_missing_one_is_named(show, actors, capsys)
     show.enqueue(lambda: show.click(None, DOWN))
     run(show, 1)
     show.path.edit(show.path.points, closed=True)
-    walk_path()
+    show.walk_path()
     _, points, speed, closed = actors[0].heard[-1]
     np.testing.assert_allclose(points, [(0, 0), (1, 1), (1, 3)], atol=1e-9)
     assert (speed, closed) == (1.2, True)
@@ -175,13 +177,14 @@ def test_a_click_sends_the_chosen_character_there(show, actors):
     _, command, _, _, facing = actors[0].heard[-1]
     assert (command.speed, facing, panel.speed.value) == (0.0, pytest.approx(math.pi / 2), 0.0)
     panel.within.value = math.nan
-    show.click((9.0, 5.0, 9.0), DOWN)
+    with pytest.raises(RequestError, match="the time must be a finite number"):
+        show.click((9.0, 5.0, 9.0), DOWN)
     assert actors[0].heard[-1][2] == pytest.approx((1.0, 2.0)), "no slider gives that"
 
 
 def test_a_target_appears_is_dragged_and_belongs_to_its_character(show, actors):
     targets, point = show.targets, (1.0, 1.1, 2.0)
-    targets.reach("left")
+    targets.reach("leftHand")
     word, first = actors[0].heard[-1]
     assert (word, set(first.reach)) == ("aim", {"leftHand"})
     assert targets.target.visible
@@ -192,7 +195,7 @@ def test_a_target_appears_is_dragged_and_belongs_to_its_character(show, actors):
     assert not targets.target.visible
     assert actors[1].heard == []
     show.choose(0)
-    show.change(show.chosen, {"speed": 2.0})
+    show.change(show.chosen, speed=2.0)
     assert actors[0].heard[-1] == ("command", Command(2.0, 0.0, reach={"leftHand": point}, look_at=point))
     targets.reach(None)
     targets.look(False)
@@ -211,6 +214,31 @@ def test_a_disc_is_for_all_characters(show, actors):
     assert not targets.disc.visible
 
 
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
+@given(st.dictionaries(st.sampled_from(["speed", "heading", "facing"]), st.floats()))
+def test_whatever_a_control_sends_the_command_is_within_limits(show, changes):
+    before = show.chosen.wanted
+    try:
+        show.change(show.chosen, **changes)
+    except RequestError:
+        assert show.chosen.wanted is before
+    assert show.chosen.wanted.within(3.8) == (show.chosen.wanted, [])
+
+
+def test_what_is_limited_or_refused_is_explained(show, capsys):
+    show.change_from_panel(speed=1e9)
+    assert show.chosen.wanted.speed == 3.8
+    assert "the speed of 1e+09 m/s was lowered to 3.80 m/s" in capsys.readouterr().err
+    for speed, reason in ((-5.0, "0 m/s or more, got -5"), (math.nan, "speed must be a finite number")):
+        with pytest.raises(RequestError, match=reason):
+            show.change_from_panel(speed=speed)
+    with pytest.raises(RequestError, match="'swim' is not a gait of this prior"):
+        show.label(show.chosen, "gait", "swim")
+    show.label(show.chosen, "gait", "run")
+    show.label(show.chosen, "gait", "any")
+    assert show.chosen.wanted == Command(3.8, 0.0)
+
+
 @pytest.mark.parametrize("where", ["poll", "command"])
 def test_an_error_in_one_character_ends_no_other_and_no_recording(show, actors, capsys, monkeypatch, where):
     def broken(*given):
@@ -220,8 +248,8 @@ def test_an_error_in_one_character_ends_no_other_and_no_recording(show, actors, 
         character.recorded = []
     run(show, 3)
     monkeypatch.setattr(actors[0], where, broken)
-    show.enqueue(lambda: [show.change(one, {"speed": 2.0}) for one in show.characters])
-    show.enqueue(lambda: show.change(show.characters[1], {"speed": 2.0}))
+    show.enqueue(lambda: [show.change(one, speed=2.0) for one in show.characters])
+    show.enqueue(lambda: show.change(show.characters[1], speed=2.0))
     show.enqueue(lambda: show.set_paused(True))
     show.enqueue(lambda: show.set_paused(False))
     show.enqueue(show.restart)
@@ -292,8 +320,9 @@ def test_a_replay_ends_in_the_present(show, actors):
 def test_a_recording_is_the_motion_that_was_shown(show, tmp_path, monkeypatch, ending):
     monkeypatch.chdir(tmp_path)
     show.panel.ending.value = ending
+    show.recorder.toggle(show.chosen, ending, None)
     with pytest.raises(RequestError, match="nothing was recorded"):
-        show.recorder.save_last("bvh", None)
+        show.recorder.toggle(show.chosen, ending, None)
     show.recorder.toggle(show.chosen, ending, None)
     run(show, 5)
     assert show.panel.record.label == "Stop and save"
@@ -303,9 +332,6 @@ def test_a_recording_is_the_motion_that_was_shown(show, tmp_path, monkeypatch, e
     whole = walk(90).slice(0, 15)
     order = [recorded.skeleton.index(name) for name in whole.skeleton.names]
     np.testing.assert_allclose(recorded.joint_positions()[:, order], whole.joint_positions(), atol=1e-4)
-    show.recorder.save_last(ending, None)
-    show.recorder.wait()
-    assert (tmp_path / f"mapctl-2.{ending}").read_bytes() == (tmp_path / f"mapctl.{ending}").read_bytes()
 
 
 def test_a_recording_that_goes_on_when_all_ends_is_saved(show, tmp_path):
@@ -320,7 +346,7 @@ def test_a_recording_that_goes_on_when_all_ends_is_saved(show, tmp_path):
 
 def test_a_recording_keeps_its_licence_on_any_rig(actors, tmp_path):
     look = CharacterLook(on_rig=lambda motion: walk(3), licence="CC0 1.0 (mine)")
-    with live_app(actors, [look, CharacterLook()]) as show:
+    with live_app(actors, look) as show:
         motion = join_chunks(show.chosen, [delivered()])
     (tmp_path / "x.glb").write_bytes(encode_motion(motion, "glb"))
     assert formats.load(tmp_path / "x.glb").licence == "CC0 1.0 (mine)"

@@ -17,9 +17,11 @@ from helpers import walk
 from rig_maker import Make, make, names_of
 from stage import delivered
 
+from controllers.common.character import Character
 from mapctl import formats, rotations
 from mapctl.commands import live
 from mapctl.commands.live import Live
+from mapctl.commands.shared.inputs import as_character, read_character
 from mapctl.motion import Motion
 from scenes.drawn_character import DrawnCharacter
 from scenes.live.character import CharacterLook, ShownCharacter, SkinnedBody
@@ -109,7 +111,8 @@ def recorded(look: CharacterLook, skeleton, frames: int) -> Motion:
 
 @pytest.mark.parametrize("ending", ["glb", "bvh"])
 def test_a_recording_is_of_the_character(hero, ending, tmp_path):
-    motion, path = recorded(CharacterLook(hero), hero.body.leveled, 12), tmp_path / f"recorded.{ending}"
+    look, path = CharacterLook(hero, as_character(hero.body).on_rig), tmp_path / f"recorded.{ending}"
+    motion = recorded(look, hero.body.leveled, 12)
     assert motion.skeleton.names == hero.standing.skeleton.names
     path.write_bytes(encode_motion(motion, ending))
     if ending == "glb":
@@ -121,22 +124,12 @@ def test_a_recording_is_of_the_character(hero, ending, tmp_path):
         np.testing.assert_allclose(vertices[: len(skinned)], skinned, atol=1e-4)
 
 
-def test_each_character_has_its_file_and_the_last_one_is_for_all_others(tmp_path):
-    files = [str(make_character_glb(tmp_path / f"{name}.glb").path) for name in "ab"]
-    drawn = live._read_drawn(Live(characters=4, character=tuple(files)))
-    assert [one.path for one in drawn] == [files[0], files[1], files[1], files[1]]
-    assert drawn[1] is drawn[2], "read once"
-    assert live._read_drawn(Live(characters=3)) == [None, None, None]
-
-
 @pytest.mark.slow
 def test_a_character_moves_on_its_own_bones(prior, tmp_path):
-    child = str(make_character_glb(tmp_path / "child.glb", size=0.6).path)
-    command = Live(character=(child,), prior=prior)
-    (drawn,) = live._read_drawn(command)
+    body = as_character(DrawnCharacter.load(make_character_glb(tmp_path / "child.glb", size=0.6).path).body)
     with ExitStack() as opened:
-        (result,) = live._start_characters(command, live._read_bodies(command, [drawn]), opened)
-        assert result.skeleton.matches(drawn.body.leveled)
+        (result,) = live._start_characters(Live(prior=prior), body, opened)
+        assert result.skeleton.matches(body.skeleton)
         chunk = next(chunk for _ in range(200) for chunk in result.poll() or _wait())
         height = float(chunk.motion(result.skeleton).joint_positions()[0, 0, 1])
         assert height == pytest.approx(0.6 * 0.95, abs=0.08), "hips of a child"
@@ -159,15 +152,9 @@ def write_rig(preset: str, path: Path) -> None:
 def test_with_a_rig_a_mannequin_moves_on_its_bones_and_recordings_are_on_it(tmp_path):
     file = tmp_path / "rig.bvh"
     write_rig("mixamo", file)
-    command = Live(rig=str(file), characters=2)
-    drawn = live._read_drawn(command)
-    bodies = live._read_bodies(command, drawn)
-    rigs = live._choose_recorded_rigs(command, drawn, bodies)
-    assert drawn == [None, None]
-    assert bodies[0].scale == pytest.approx(0.8, abs=0.07)
-    assert (
-        recorded(CharacterLook(on_rig=rigs[0]), bodies[0].skeleton, 6).skeleton.names
-        == formats.load(file).skeleton.names
-    )
-    plain = live._choose_recorded_rigs(Live(), [None], [bodies[0]])
-    assert plain == [None], "canonical joints stay"
+    body = read_character(str(file))
+    assert body.scale == pytest.approx(0.8, abs=0.07)
+    motion = recorded(CharacterLook(on_rig=body.on_rig), body.skeleton, 6)
+    assert motion.skeleton.names == formats.load(file).skeleton.names
+    plain = recorded(CharacterLook(on_rig=Character().on_rig), Character().skeleton, 6)
+    assert plain.skeleton is Character().skeleton, "canonical joints stay"

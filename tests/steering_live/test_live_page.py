@@ -1,4 +1,4 @@
-"""The page: requests of its own origin only, messages of its script, keys and sticks, and limits of inputs."""
+"""The page: requests of its own origin only, messages of its script, keys and sticks."""
 
 import json
 import math
@@ -7,25 +7,13 @@ import urllib.request
 
 import pytest
 import viser
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from websockets.asyncio import server as websockets_server
 from websockets.datastructures import Headers
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from mapctl.intent.steering import Command
-from scenes.live.inputs import (
-    ACTIONS,
-    HELP,
-    KEYS,
-    UNCONDITIONED,
-    Driving,
-    InputLimits,
-    SteeringInputs,
-    find_direction,
-    parse_point,
-)
+from mapctl.errors import RequestError
+from scenes.live.inputs import ACTIONS, HELP, KEYS, Driving, find_direction, read_position
 from scenes.live.page import PageChannel, PageState, is_own_page, open_server, parse_state
 
 OWN = {"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080", "Upgrade": "websocket"}
@@ -126,27 +114,27 @@ def test_what_is_no_state_is_none(text):
 
 
 class Deck:
-    """Notes what it is asked; the camera looks along +X."""
+    """Notes what it is asked, angles in degrees; the camera looks along +X."""
 
     def __init__(self):
         self.heard: list[tuple] = []
         self._facings, self.locked = iter((70.0, 75.0)), None
-        self.chosen, self.view, self.limits = self, self, InputLimits(3.8, {})
+        self.chosen, self.view, self.fastest = self, self, 3.8
         self.driving = Driving(self)
 
     facing = property(lambda self: math.radians(next(self._facings)))
 
-    def steer(self, *asked):
-        self.heard.append(("steer", *asked))
+    def steer(self, speed, *angles):
+        self.heard.append(("steer", speed, *(angle if angle is None else math.degrees(angle) for angle in angles)))
 
     def act(self, action):
         self.heard.append(("act", action))
 
     def find_heading(self, direction, viewer):
-        return 90.0 - math.degrees(math.atan2(*direction))
+        return math.pi / 2 - math.atan2(*direction)
 
     def find_lock(self):
-        return self.locked
+        return self.locked and math.radians(self.locked)
 
     def hold(self, *codes: str, page: int = 0, at: float | None = None) -> None:
         self.driving.update(page, PageState(keys=frozenset(codes)))
@@ -209,9 +197,9 @@ def test_strafing_keeps_the_facing_and_so_does_standing_after_it(deck):
     deck.hold(at=0.6)
     deck.hold("KeyA", at=0.8)
     assert deck.heard == [
-        ("steer", 1.2, pytest.approx(180.0), 70.0),
-        ("steer", 1.2, pytest.approx(45.0), 70.0),
-        ("steer", 0.0, None, 70.0),
+        ("steer", 1.2, pytest.approx(180.0), pytest.approx(70.0)),
+        ("steer", 1.2, pytest.approx(45.0), pytest.approx(70.0)),
+        ("steer", 0.0, None, pytest.approx(70.0)),
         ("steer", 1.2, pytest.approx(180.0), None),
     ]
 
@@ -221,7 +209,7 @@ def test_a_locked_facing_holds_in_all_directions_and_the_right_stick_goes_before
     deck.hold("KeyW", at=0.0)
     deck.locked = -35.0
     deck.driving.step(0.2)
-    assert deck.heard == [("steer", 1.2, 90.0, -30.0), ("steer", 1.2, 90.0, -35.0)]
+    assert deck.heard == [("steer", 1.2, 90.0, pytest.approx(-30.0)), ("steer", 1.2, 90.0, pytest.approx(-35.0))]
     deck.driving.update(0, PageState(keys={"KeyW"}, aim=(1.0, 0.0)))
     deck.driving.step(0.4)
     assert deck.heard[-1] == ("steer", 1.2, 90.0, pytest.approx(0.0))
@@ -237,55 +225,8 @@ def test_directions_add_up():
     assert all(code.removeprefix("Key") in text for code in ACTIONS)
 
 
-LIMITS = InputLimits(3.8, {"gait": ["run", "walk"], "style": ["old"]})
-ANYTHING = st.one_of(
-    st.floats(), st.integers(), st.text(max_size=5), st.none(), st.booleans(), st.lists(st.floats(), max_size=2)
-)
-CHANGES = st.dictionaries(st.sampled_from(["speed", "heading", "facing", "step_length"]), ANYTHING)
-
-
-@settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])  # on a starved core
-@given(CHANGES, CHANGES)
-def test_whatever_is_asked_the_inputs_are_a_command_within_limits(first, second):
-    inputs = SteeringInputs()
-    for changes in (first, second):
-        inputs, _ = LIMITS.change(inputs, changes)
-        assert inputs.command.within(3.8) == (inputs.command, [])
-        assert abs(inputs.heading) <= 180
-        assert inputs.facing is None or abs(inputs.facing) <= 180
-
-
-@pytest.mark.parametrize(
-    ("name", "asked", "held", "text"),
-    [
-        ("speed", -5.0, 0.0, "A speed of -5 m/s is out of range: 0 to 3.8 m/s."),
-        ("speed", 1e9, 3.8, "A speed of 1e+09 m/s is out of range: 0 to 3.8 m/s."),
-        ("speed", math.nan, 1.2, "'nan' is not a speed in m/s."),
-        ("speed", "fast", 1.2, "'fast' is not a speed in m/s."),
-        ("step_length", 99.0, 1.2, "A step length of 99 m is out of range: 0.3 to 1.2 m."),
-        ("heading", 370, 10.0, None),
-        ("facing", math.inf, None, "'inf' is not a facing in degrees."),
-        ("facing", None, None, None),
-    ],
-)
-def test_what_is_impossible_is_limited_and_explained(name, asked, held, text):
-    inputs, notes = LIMITS.change(SteeringInputs(), {name: asked})
-    assert getattr(inputs, name) == held
-    assert notes == ([] if text is None else [text])
-
-
-def test_labels_are_of_the_prior_and_of_one_group_at_a_time():
-    inputs, notes = LIMITS.change(SteeringInputs(), {"labels": {"gait": "run"}})
-    inputs, more = LIMITS.change(inputs, {"labels": {"style": "old"}})
-    assert notes + more == []
-    assert inputs.command == Command(1.2, 0.0, labels=("gait=run", "style=old"))
-    inputs, notes = LIMITS.change(inputs, {"labels": {"gait": "swim", "mood": "bad"}})
-    assert inputs.labels == {"gait": "run", "style": "old"}
-    assert notes[0] == "'swim' is not a gait of this prior."
-    assert LIMITS.change(inputs, {"labels": {"gait": UNCONDITIONED}})[0].labels == {"style": "old"}
-
-
 @pytest.mark.parametrize("value", ["x", (1, 2), (math.nan, 0, 0), (0, 1e9, 0), None])
 def test_points_are_finite_and_near(value):
-    assert parse_point(value) is None
-    assert parse_point([1, 2, 3.5]) == (1.0, 2.0, 3.5)
+    with pytest.raises(RequestError, match="position"):
+        read_position(value)
+    assert read_position([1, 2, 3.5]) == (1.0, 2.0, 3.5)

@@ -6,7 +6,6 @@ from contextlib import contextmanager
 import pytest
 from stage import Actor, live_app, run
 
-from mapctl.curves.obstacles import Obstacle
 from mapctl.intent.steering import Command
 from mapctl.streaming.messages import Message
 from mapctl.streaming.sender import guide
@@ -36,9 +35,6 @@ class Stream:
 
     def forget(self, character):
         self.heard.append(("forget", character))
-
-    def pause(self):
-        self.heard.append(("pause",))
 
 
 @contextmanager
@@ -72,12 +68,10 @@ def test_numbers_and_labels_become_the_command_of_their_character(stage):
     assert actors[1].heard[-1] == ("command", Command(0.5, 0.0, -math.pi / 2))
     assert (show.panel.speed.value, show.panel.heading.value) == (2.0, 90)
     assert show.panel.labels["style"].value == "old"
-    send(("2/facing",), ("style", "any"), ("step_length", 0.5))
+    send(("2/facing",), ("style", "any"), ("speed", 0.0))
     assert actors[1].heard[-1] == ("command", Command(0.5, 0.0))
-    assert actors[0].heard[-1] == ("command", Command(2.0, math.pi / 2, step_length=0.5))
-    send(("step_length",), ("stop",))
     assert actors[0].heard[-1] == ("command", Command(0.0, math.pi / 2))
-    send(("stop",), ("speed", 1.0))
+    send(("speed", 0.0), ("speed", 1.0))
     assert actors[0].heard[-1][1].speed == 1.0, "the last of what came counts"
 
 
@@ -97,7 +91,7 @@ def test_hands_reach_together_and_let_go_alone(stage):
     assert (actors[0].heard[-1][1].reach, actors[0].heard[-1][1].look_at) == ({}, None)
 
 
-def test_places_and_paths_are_gone_to_after_what_else_came(stage):
+def test_positions_are_gone_to_after_what_else_came(stage):
     _, actors, _, send = stage
     send(("goto", 1.0, 2.0), ("speed", 0.0))
     assert words(actors[0]) == ["command", "go"]
@@ -107,18 +101,10 @@ def test_places_and_paths_are_gone_to_after_what_else_came(stage):
     assert actors[1].heard[-1][2:] == ((-1.0, 3.0), 1.5, pytest.approx(math.pi / 2))
     send(("goto", 1.0, 2.0, 99.0))
     assert actors[0].heard[-1][3] == 10.0
-    send(("path", 0.0, 0.0, 1.0, 1.0, 2.0, 1.0))
-    assert actors[0].heard[-1] == ("walk", [(0.0, 0.0), (1.0, 1.0), (2.0, 1.0)], 1.2)
 
 
-def test_a_disc_a_pause_and_a_restart_are_for_everybody(stage):
+def test_a_pause_and_a_restart_are_for_all_characters(stage):
     show, actors, stream, send = stage
-    send(("disc", 1.0, 4.0, 0.5))
-    assert [actor.heard[-1][1].obstacles for actor in actors] == [(Obstacle((1.0, 4.0), 0.5),)] * 2
-    assert show.panel.disc.value is True
-    send(("disc",))
-    assert actors[1].heard[-1][1].obstacles == ()
-    assert show.panel.disc.value is False
     send(("pause",))
     send(("pause", 1))
     assert [a.heard[-1] for a in actors] == [("pause", True)] * 2
@@ -128,8 +114,7 @@ def test_a_disc_a_pause_and_a_restart_are_for_everybody(stage):
     send(("hand/left", 1.0, 1.0, 1.0))
     send(("reset",))
     assert [words(a)[-1] for a in actors] == ["reset"] * 2
-    assert show.chosen.inputs.reach == {}
-    assert stream.heard.count(("pause",)) == 2
+    assert show.chosen.wanted.reach == {}
     assert [entry for entry in stream.heard if entry[0] == "forget"] == [("forget", 0), ("forget", 1)]
 
 
@@ -148,11 +133,7 @@ def test_every_frame_goes_to_the_stream_too(stage):
         ("look", 0.0, -1e300, 0.0),
         ("goto", 1e5, 0.0),
         ("goto", 0.0, math.nan),
-        ("path", 0.0, 0.0, 0.0, 1e9),
-        ("path", 0.0, 0.0, 1.0),
-        ("disc", 0.0, 1.0, 5.0),
-        ("disc", 1e9, 1.0, 0.5),
-        ("3/stop",),
+        ("3/speed", 1.0),
         ("dance",),
         ("gait", 3.0),
         ("speed", "fast"),
@@ -160,9 +141,9 @@ def test_every_frame_goes_to_the_stream_too(stage):
 )
 def test_an_impossible_request_is_reported_and_changes_nothing(stage, capsys, message):
     show, actors, _, send = stage
-    before = show.chosen.inputs
+    before = show.chosen.wanted
     send(message)
     run(show, 20)
-    assert show.chosen.inputs == before
+    assert show.chosen.wanted == before
     assert {word for actor in actors for word in words(actor)} <= {"aim"}, "the same as before is aimed at"
     assert capsys.readouterr().err.startswith("mapctl: OSC: ")

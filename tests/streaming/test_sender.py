@@ -83,7 +83,6 @@ def test_frames_come_when_they_are_due_and_are_those_that_were_put(stream, ports
     stream.close()
     sent = stream.statistics
     assert (sent.frames_sent, sent.not_sent, sent.fault) == (9, 0, "")
-    assert 33 <= sent.largest_gap_ms < 33.4 + 1000 * ALLOWED
 
 
 @pytest.mark.slow

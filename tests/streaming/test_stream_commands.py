@@ -114,7 +114,7 @@ def test_characters_obey_what_comes_over_osc_and_their_poses_go_out(prior, tmp_p
             loop(show, lambda: time.perf_counter() > end)
 
         def play(show):
-            client.send_message("/mapctl/2/stop", [])
+            client.send_message("/mapctl/2/speed", 0.0)
             wait(show, 1.0)
             play.asked, play.target = len(second.frames), second.joints()[-1, shoulder] + [0.3, 0.2, 0.1]
             client.send_message("/mapctl/2/hand/left", play.target.tolist())
@@ -159,7 +159,7 @@ def test_a_character_follows_its_osc_commands(tmp_path):
             client.send_message("/mapctl/speed", 1.5)
             begun = len(listener.frames)
             listener.wait(begun + 210)
-            client.send_message("/mapctl/stop", [])
+            client.send_message("/mapctl/speed", 0.0)
             listener.wait(begun + 330)
         finally:
             show.send_signal(signal.SIGINT)

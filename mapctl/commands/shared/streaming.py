@@ -98,5 +98,5 @@ def summarise(stream: "PoseStream") -> str:
     lost = f", {sent.not_sent} not sent ({sent.fault})" if sent.not_sent else ""
     return (
         f"stream    {sent.frames_sent} frames to {', '.join(map(str, stream.endpoints))}, {sent.late} late, "
-        f"at most {sent.largest_lateness_ms:.1f} ms after they were due, largest gap {sent.largest_gap_ms:.1f} ms{lost}"
+        f"at most {sent.largest_lateness_ms:.1f} ms after they were due{lost}"
     )
