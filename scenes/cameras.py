@@ -18,13 +18,8 @@ _MAX_FRAMES = 400
 
 
 _AZIMUTH_DEG = 30.0
-_BOUNDS = (
-    ("azimuth_deg", -360, 360),
-    ("elevation_deg", 0, 89),
-    ("fov_deg", 5, 120),
-    ("zoom", 0.05, 20),
-    ("smooth_seconds", 0.01, 60),
-)
+_SMOOTH_SECONDS = 0.6  # standard deviation of the Gaussian by which a following camera is smoothed
+_BOUNDS = (("azimuth_deg", -360, 360), ("elevation_deg", 0, 89), ("fov_deg", 5, 120), ("zoom", 0.05, 20))
 
 
 @dataclass(frozen=True)
@@ -44,8 +39,6 @@ class CameraSettings:
     """Vertical field of view, degrees."""
     zoom: float = 1.0
     """Factor by which the camera is closer than needed (over 1) or further away; 2 halves the distance."""
-    smooth_seconds: float = 0.6
-    """Smoothing of a following camera: standard deviation of a Gaussian over time, seconds."""
 
     def __post_init__(self):
         if self.kind not in ("fixed", "follow", "top"):
@@ -137,7 +130,7 @@ def compute_views(
     axes, fov = camera_axes(settings), np.radians(settings.fov_deg)
     centre = np.zeros_like(targets)
     if settings.kind == "follow":
-        centre = _smooth(targets, settings.smooth_seconds * fps)
+        centre = _smooth(targets, _SMOOTH_SECONDS * fps)
         centre[:, 1] = np.median(targets[:, 1])
     seen = points - (centre[:, None] if len(points) == len(centre) else 0.0)
     seen = seen[:: max(1, len(seen) // _MAX_FRAMES)].reshape(-1, 3)

@@ -236,7 +236,6 @@ _NEAR = 0.1
 _DPI = 100
 _THICKNESS = 1.3
 """Width of a stick, in radii of the body part; 2 would be as thick as the body."""
-_STICK_SHADOW = 0.12
 
 
 class StickPainter:
@@ -260,24 +259,9 @@ class StickPainter:
         axes.set(xlim=(0, view.width), ylim=(view.height, 0))
         for surface in content.ground:
             _draw_flat(axes, view, surface)
-        sticks = [(*figure.body.sticks(figure.frame), figure) for figure in content.figures]
-        for ends, radii, _, _ in sticks:  # shadows are the sticks laid on the ground along the light
-            fallen = raise_onto(ends, content.terrain, -1)
-            fallen = raise_onto(fallen - fallen[..., 1:2] * (LIGHT / LIGHT[1]), content.terrain)
-            _draw_lines(
-                axes, view, fallen, radii, np.tile([*colours.rgb(colours.SHADOW), _STICK_SHADOW], (len(ends), 1))
-            )
-        for ends, radii, rgb, figure in sticks:
-            _draw_lines(axes, view, ends, radii, figure.tint(rgb))
-        picture = self._shoot(view)
-        if not content.veils:
-            return picture
-        for figure in content.veils:
+        for figure in (*content.veils, *content.figures):
             ends, radii, rgb = figure.body.sticks(figure.frame)
-            _draw_lines(axes, view, ends, radii + figure.shell, figure.tint(rgb))
-        return blend_veils(picture, self._shoot(view))
-
-    def _shoot(self, view: View) -> Array:
+            _draw_lines(axes, view, ends, radii, figure.tint(rgb))
         self._canvas.draw()
         return np.asarray(self._canvas.buffer_rgba())[: view.height, : view.width, :3].copy()
 

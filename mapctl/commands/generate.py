@@ -38,8 +38,8 @@ class Generate(ModelCommand, options.ReadOptions):
     speeds."""
     temperature: options.Number = 1.0
     """Temperature of the samples, 0 to 2: 0 is the prior's mean, 1 the prior itself."""
-    start: Annotated[str | None, arg(metavar="CLIP|INDEX")] = None
-    """A clip (.bvh, .npz, .amc) to continue from, or the index of an initial state for all; sampled if not given."""
+    start: Annotated[Path | None, arg(metavar="CLIP")] = None
+    """A clip to continue from; initial states are sampled if not given."""
     prior: options.Prior = "locomotion"
     style: Annotated[str | None, arg(metavar="NAME,NAME")] = None
     """Gait, style and pace by the names of the prior's data, such as run or elderly,walk; `none` leaves the prior
@@ -82,7 +82,7 @@ def run(command: Generate) -> int:
     seeds = torch.randint(2**62, (command.count,), generator=torch.Generator().manual_seed(command.seed)).tolist()
     with outputs.make_folder(command.out) as folder, outputs.explain_progress(command.count, "clips") as finished:
         for number, seed in enumerate(seeds):
-            own = settings if settings.start is not None else replace(settings, start=starts[number])
+            own = replace(settings, start=starts[number])
             pieces = draw(generator=torch.Generator().manual_seed(seed), settings=own)
             motions = (outputs.mark_motion(character.on_rig(piece.motion)) for piece in pieces)
             _write(command, motions, folder / f"generated_{number:03d}{command.to}", frames)
@@ -96,21 +96,18 @@ def _check_settings(command: Generate) -> tuple[GenerateSettings, Motion | None]
         raise RequestError(f"the count must be 1 to {_MAX_CLIPS}, got {command.count}")
     outputs.check_folder(command.out)
     formats.check_ending(command.out / f"clip{command.to}")
-    numbered = command.start is not None and command.start.lstrip("-").isdecimal()
     finishing = None if command.no_footing else FootCleanupSettings()
-    start = int(command.start) if command.start and numbered else None
     planted = SIGMA_PLANTED if command.no_footing and command.refiner is None else None
     settings = GenerateSettings(
         command.temperature,
-        start,
         condition_on_start=command.style is None,
         vary_paces=command.style != "none",
         foot_cleanup=finishing,
         sigma_planted=planted,
     )
-    if command.start is None or numbered:
+    if command.start is None:
         return settings, None
-    clip, rig = inputs.read_clip(Path(command.start), command)
+    clip, rig = inputs.read_clip(command.start, command)
     return settings, clip if rig is None else to_canonical(clip, rig)[0]
 
 

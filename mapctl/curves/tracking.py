@@ -8,6 +8,7 @@ states on the road, Newson and Krumm 2009). The walk is taken by its own length,
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,10 +19,9 @@ from torch import Tensor
 from mapctl.curves.curve import Curve
 
 _STEP = 0.02  # metres between neighbouring arcs, and between the walk's positions that are looked at
-_MAX_ARCS = 10_000  # positions and arcs: of long walks both lie farther apart
+_MAX_ARCS = 4_000  # positions and arcs: of long walks both lie farther apart
 _MAX_PACE_RATIO = 3  # arc per metre walked, at most: bends and corners may be cut
 _BACKWARD_COST = 0.3**2  # square metres: going back must explain the walk better than going on or staying by 0.3 m
-_PRUNING_MARGIN = 3.0 / _STEP  # squared metres, summed: arcs that explain the walk so much worse are dropped
 _REFINED_STEP = 0.04  # metres between refined arcs
 _TIE_BREAK = 0.01  # square metres per metre from the tracked arc: of two equally near arcs the one nearer to it wins
 
@@ -78,43 +78,37 @@ class _ArcGrid:
         numbers = torch.arange(-more, lap + more + (not curve.closed), dtype=torch.float64)
         return _ArcGrid(step, curve.point(numbers * step).numpy(), -more, lap, curve.closed)
 
-    def within(self, first: int, stop: int) -> tuple[int, int]:
-        """Clip a range of numbers to those that exist."""
-        return (first, stop) if self.closed else (max(first, self.first), min(stop, self.first + len(self.positions)))
-
-    def squared_distances(self, point: Float[ndarray, " dims"], first: int, stop: int) -> Float[ndarray, " arcs"]:
-        """Return squared distances from a position to the arcs first to stop."""
-        numbers = np.arange(first - self.first, stop - self.first)
-        near = self.positions.take(numbers, axis=0, mode="wrap") if self.closed else self.positions[numbers]
-        return np.square(near - point).sum(-1)
+    def squared_distances(self, point: Float[ndarray, " dims"]) -> Float[ndarray, " arcs"]:
+        """Return squared distances from a position to all arcs."""
+        return np.square(self.positions - point).sum(-1)
 
 
 def _find_best_arcs(
     grid: _ArcGrid, positions: Float[ndarray, "count dims"], first: int, stop: int
 ) -> Float[ndarray, " count"]:
-    """Find the numbers of the arcs at the walk's positions; the first is one of first to stop."""
+    """Find the numbers of the arcs at the walk's positions; the first is one of first to stop. They go on from lap to
+    lap of a closed curve."""
     most = _MAX_PACE_RATIO + 1
     # Columns: from how many arcs ahead (going back) to how many behind (going on); of equal costs the slowest.
     moves = np.arange(most, -most - 1, -1)
     price = np.where(moves > 0, _BACKWARD_COST * moves, 0.0) + 1e-9 * abs(moves)
-    first, stop = grid.within(first, stop)
-    cost = grid.squared_distances(positions[0], first, stop)
-    cameby: list[tuple[int, ndarray]] = []
+    allowed = np.arange(first, stop) - grid.first
+    allowed = allowed % grid.lap if grid.closed else allowed[(allowed >= 0) & (allowed < len(grid.positions))]
+    cost = np.full(len(grid.positions), np.inf)
+    cost[allowed] = grid.squared_distances(positions[0])[allowed]
+    beside: dict[str, Any] = {"mode": "wrap"} if grid.closed else {"constant_values": np.inf}
+    came_by: list[ndarray] = []
     for position in positions[1:]:
-        alive = np.flatnonzero(cost <= cost.min() + _PRUNING_MARGIN)  # arcs that may still turn out best
-        first, stop, cost = first + int(alive[0]), first + int(alive[-1]) + 1, cost[alive[0] : alive[-1] + 1]
-        low, high = grid.within(first - most, stop + most)
-        padded = np.pad(cost, 2 * most, constant_values=np.inf)[low - first + most : high - first + 3 * most]
-        around = np.lib.stride_tricks.sliding_window_view(padded, 2 * most + 1)[:, ::-1] + price
+        around = np.lib.stride_tricks.sliding_window_view(np.pad(cost, most, **beside), 2 * most + 1)[:, ::-1] + price
         picked = around.argmin(-1)
-        cost = np.take_along_axis(around, picked[:, None], axis=-1)[:, 0]
-        cost = cost + grid.squared_distances(position, low, high)
-        cameby.append((low, moves[picked].astype(np.int8)))
-        first, stop = low, high
-    found = [first + int(cost.argmin())]
-    for low, back in reversed(cameby):
-        found.append(found[-1] + int(back[found[-1] - low]))
-    return np.array(found[::-1], dtype=float)
+        cost = np.take_along_axis(around, picked[:, None], axis=-1)[:, 0] + grid.squared_distances(position)
+        came_by.append(moves[picked].astype(np.int8))
+    found = [int(cost.argmin())]
+    for back in reversed(came_by):
+        found.append(found[-1] + int(back[found[-1] % len(back)]))
+    numbers = grid.first + np.array(found[::-1], dtype=float)
+    laps = math.ceil((first - numbers[0]) / grid.lap) if grid.closed else 0
+    return numbers + laps * grid.lap
 
 
 def _refine_arcs(
