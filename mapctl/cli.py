@@ -24,8 +24,9 @@ from typing import Annotated, Any
 import tyro
 
 from mapctl import __version__
-from mapctl.commands import COMMANDS, MANY_THREADS, SUBCOMMANDS, load_command
+from mapctl.commands import COMMANDS, MANY_THREADS, load_command
 from mapctl.commands.shared.command import INTERRUPTED, INVALID, SIGNALLED, UNREAD, describe_error, use_single_thread
+from mapctl.commands.train import RECIPES, load_recipe
 from mapctl.errors import MapctlError, RequestError
 
 _ANSI_COLOUR = re.compile(r"\x1b\[[\d;]*m")
@@ -79,7 +80,7 @@ def parse(words: Sequence[str]) -> Any:
     if name not in MANY_THREADS:
         use_single_thread()
     command = load_command(name)
-    kind = _join(SUBCOMMANDS[name]) if name in SUBCOMMANDS else command
+    kind = _join({each: load_recipe(each) for each in RECIPES}) if name == "train" else command
     return _read_options(kind, others, f"mapctl {name}", command.__doc__ or "")
 
 
@@ -96,9 +97,8 @@ def _read_options(kind: Any, words: Sequence[str], prog: str, description: str) 
     except SystemExit as stop:
         if stop.code == 0:
             raise
-        known = prog != "mapctl" and words and words[0] in SUBCOMMANDS.get(prog.split()[1], {})
-        helped = f"{prog} {words[0]} --help" if known else f"{prog} --help"
-        raise RequestError(f"{_shorten_usage_error(explained.getvalue())} (see {helped})") from None
+        helped = [prog, *(word for word in words[:1] if prog == "mapctl train" and word in RECIPES), "--help"]
+        raise RequestError(f"{_shorten_usage_error(explained.getvalue())} (see {' '.join(helped)})") from None
 
 
 _DESCRIPTION = (

@@ -12,7 +12,7 @@ import tiny_stitcher
 import tiny_transformer
 import tiny_tweener
 
-from mapctl.commands.train import KINDS
+from mapctl.commands.train import RECIPES, load_recipe
 from priors.lstm_gmm.network import LstmGmmConfig
 from priors.refiner import RefinerConfig
 
@@ -37,9 +37,11 @@ _QUICK = "lstm-gmm", "path"  # trained and validated in about a second
 def small_settings(name: str, data: Path, out: Path, prior: str = "locomotion", **changes: Any) -> Any:
     """Settings of a model; `prior` is the density of a refiner."""
     own = _SMALL[name] | ({"density": prior} if name == "refiner" else {})
-    return KINDS[name](**({"data": data, "out": out, "steps": 6, "validate_steps": 2, "quiet": True} | own | changes))
+    return load_recipe(name)(
+        **({"data": data, "out": out, "steps": 6, "validate_steps": 2, "quiet": True} | own | changes)
+    )
 
 
-def list_params(names: Iterable[str] = KINDS) -> list:
+def list_params(names: Iterable[str] = RECIPES) -> list:
     """Parameters of a test for these models; all but the quickest are marked slow."""
     return [pytest.param(name, marks=() if name in _QUICK else pytest.mark.slow, id=name) for name in names]

@@ -12,7 +12,8 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
 from mapctl.cli import STYLE
-from mapctl.commands import COMMANDS, SUBCOMMANDS, load_command
+from mapctl.commands import COMMANDS, load_command
+from mapctl.commands.train import load_recipe
 
 _DEFAULT = re.compile(r"\s*\((default: (?P<value>.*)|required)\)\s*$", re.DOTALL)
 
@@ -53,7 +54,7 @@ def _describe(kind: type) -> str:
 
 
 def _format_options(words: list[str]) -> Iterator[str]:
-    kind = load_command(words[0]) if len(words) == 1 else SUBCOMMANDS[words[0]][words[1]]
+    kind = load_command(words[0]) if len(words) == 1 else load_recipe(words[1])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # tyro has no other interface to its options
         parser = tyro.extras.get_parser(kind, config=STYLE)

@@ -2,10 +2,7 @@
 may import every package, and nothing else imports them.
 """
 
-from collections.abc import Mapping
 from importlib import import_module
-
-from mapctl.commands.train import KINDS
 
 COMMANDS = {
     "demo": ("Demo", "A character walks a figure of eight: motion, film, contact sheet and report."),
@@ -32,8 +29,6 @@ COMMANDS = {
     "bench": ("Bench", "Cost on this machine: following a curve, and steering."),
 }
 """Class of options and summary of each command, by the name the user types, in the order of the help."""
-SUBCOMMANDS: dict[str, Mapping[str, type]] = {"train": KINDS}
-"""The sub-commands of commands that have some."""
 MANY_THREADS = {"blender-addon", "convert", "info", "render", "train"}
 """Commands that compute with as many threads as there are, or decide it themselves."""
 

@@ -2,11 +2,10 @@
 `priors.training.recipes`.
 """
 
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 
-_RECIPES = {
+RECIPES = {
     "lstm-gmm": "DensitySettings",
     "refiner": "RefinerSettings",
     "denoiser": "DenoiserSettings",
@@ -17,26 +16,12 @@ _RECIPES = {
     "tweener": "TweenerSettings",
     "stitcher": "StitcherSettings",
 }
+"""Settings of trainable models by their name in `mapctl train`."""
 
 
-class _Kinds(Mapping[str, type]):
-    """Settings by the name of the model; a recipe is imported when it is looked up."""
-
-    def __getitem__(self, name: str) -> type:
-        return getattr(import_module(f"priors.training.recipes.{name.replace('-', '_')}"), _RECIPES[name])
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(_RECIPES)
-
-    def __len__(self) -> int:
-        return len(_RECIPES)
-
-    def __contains__(self, name: object) -> bool:
-        return name in _RECIPES
-
-
-KINDS = _Kinds()
-"""Trainable models by their name in `mapctl train`."""
+def load_recipe(name: str) -> type:
+    """Import the recipe of a model and return its settings."""
+    return getattr(import_module(f"priors.training.recipes.{name.replace('-', '_')}"), RECIPES[name])
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,9 @@ from mapctl.kinematics.moving import rotate_world
 from mapctl.motion import Motion
 from mapctl.numerics import gaussian
 from mapctl.retarget import RigMap
-from mapctl.retarget.character import SIDES
+from mapctl.retarget.character import LEGS, SIDES, limb_extension
 from mapctl.retarget.hands import soft_clamp
+from mapctl.retarget.legs import FREE_EXTENSION, MAX_EXTENSION, find_missing_length
 from mapctl.retarget.rigs import Rig
 from mapctl.skeleton import CANONICAL
 
@@ -97,8 +98,6 @@ class RiggedMotion:
         return replace(motion, root_position=root, local_quat_xyzw=keep(own, other, opposite), moving_offsets=moving)
 
 
-_FREE_EXTENSION = 0.985  # of the leg: a leg may be that straight, whatever it was
-_MAX_EXTENSION = 0.9995  # of the leg that one may be at most
 _SOFT_SHARE = 0.004  # of the leg, before the most that it may be, over which it gives in
 _HIP_DROP_SECONDS = 0.12  # seconds over which hips go down for a leg that is too short, and up again
 _FORWARD_SHARE = 0.1  # of an added bend, by how much it is where knees usually go rather than where this one went
@@ -158,7 +157,7 @@ def _turn_leg(
     upper, lower, whole = thigh.norm(dim=-1), shin.norm(dim=-1), (thigh + shin).norm(dim=-1)
     # As far as it is wanted, and ever less beyond what is nearly the most. A leg that was straighter may stay so.
     wanted, length = target.norm(dim=-1), upper + lower
-    most, soft = torch.maximum(_MAX_EXTENSION * length, whole), _SOFT_SHARE * length
+    most, soft = torch.maximum(MAX_EXTENSION * length, whole), _SOFT_SHARE * length
     limited = soft_clamp(wanted, most, soft)
     far = torch.where(wanted <= whole, wanted, torch.maximum(limited, torch.minimum(whole, wanted)))
     swing = rotations.between_vectors(thigh + shin, target)
@@ -178,16 +177,10 @@ def _turn_leg(
 
 def _find_hips_dip(rigged: RiggedMotion, ankles: Float[Tensor, "frames 2 3"]) -> Float[Tensor, " frames"]:
     """Find by how much hips go down for the legs to reach, metres, smooth over time; 0 where they reach anyway."""
-    hips, knees, now = (rigged.positions(part) for part in ("UpperLeg", "LowerLeg", "Foot"))
-    length = (knees - hips).norm(dim=-1) + (now - knees).norm(dim=-1)
-    was = (now - hips).norm(dim=-1)
-    most = torch.maximum(length * _FREE_EXTENSION, was.minimum(length * _MAX_EXTENSION))
-    to_ankles = ankles - hips
-    down = -to_ankles[..., 1]
-    level = to_ankles[..., ::2].square().sum(-1)
-    short = (down - (most.square() - level).clamp_min(0).sqrt()).clamp_min(0)
-    wanted = (ankles - now).norm(dim=-1) > _TINY
-    short = torch.where((down > 0.5 * most) & wanted, short, 0.0).amax(dim=-1)
+    extension = limb_extension(rigged.canonical, LEGS).clamp(FREE_EXTENSION, MAX_EXTENSION)
+    short, down = find_missing_length(rigged.canonical, ankles, extension)
+    wanted = (ankles - rigged.positions("Foot")).norm(dim=-1) > _TINY
+    short = torch.where((down > 0.5) & wanted, short.clamp_min(0), 0.0).amax(dim=-1)
     if float(short.max()) == 0:
         return short
     return gaussian.envelope(short[:, None], _HIP_DROP_SECONDS, float(rigged.motion.fps))[:, 0]

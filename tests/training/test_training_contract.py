@@ -17,14 +17,14 @@ from trainable_models import list_params, small_settings
 
 import priors
 from mapctl import cli
-from mapctl.commands.train import KINDS
+from mapctl.commands.train import RECIPES, load_recipe
 from mapctl.errors import CheckpointError, MapctlError, RequestError
 from priors import checkpoints
 from priors.training import loop
 from priors.training.loop import GradientTrainer, train, warmup_cosine
 
 pytestmark = pytest.mark.usefixtures("small_judgements")
-NETWORKS = [name for name in KINDS if name not in ("keyframe-timing", "refiner")]
+NETWORKS = [name for name in RECIPES if name not in ("keyframe-timing", "refiner")]
 LOADED = {
     "lstm-gmm": priors.load,
     "refiner": priors.load_refiner,
@@ -81,7 +81,7 @@ def test_a_finished_run_is_a_model_that_loads_with_its_card_and_a_log(name, fini
 @pytest.mark.parametrize("name", list_params())
 def test_a_run_that_was_killed_goes_on_to_the_same_weights(name, finished, data, prior, tmp_path):
     settings = small_settings(name, data, tmp_path / "run", prior, checkpoint_minutes=0.0)
-    with killing(KINDS[name], 3):
+    with killing(load_recipe(name), 3):
         train(settings)
     with pytest.raises(RequestError, match="pass --resume"):
         train(settings)
@@ -120,7 +120,7 @@ def test_a_damaged_checkpoint_is_refused(damage, finished, data, tmp_path):
 
 @pytest.mark.parametrize("name", list_params(NETWORKS))
 def test_a_run_that_diverges_stops_and_keeps_its_last_checkpoint(name, data, tmp_path, monkeypatch):
-    make = KINDS[name].make_trainer
+    make = load_recipe(name).make_trainer
 
     def make_broken(settings, parts):
         trainer = make(settings, parts)
@@ -133,7 +133,7 @@ def test_a_run_that_diverges_stops_and_keeps_its_last_checkpoint(name, data, tmp
         trainer.losses = losses
         return trainer
 
-    monkeypatch.setattr(KINDS[name], "make_trainer", make_broken)
+    monkeypatch.setattr(load_recipe(name), "make_trainer", make_broken)
     with pytest.raises(MapctlError, match="diverged at step 4"):
         train(small_settings(name, data, tmp_path / "run", checkpoint_minutes=0.0))
     assert read_step(tmp_path / "run") == 3
@@ -144,7 +144,7 @@ def test_a_run_that_diverges_stops_and_keeps_its_last_checkpoint(name, data, tmp
 def test_training_ends_where_validation_no_longer_improves_with_the_best_weights(
     patience, last, best, data, tmp_path, monkeypatch
 ):
-    scores, seen, make = {0: 9.0, 2: 3.0, 4: 5.0, 6: 4.0}, {}, KINDS["path"].make_trainer
+    scores, seen, make = {0: 9.0, 2: 3.0, 4: 5.0, 6: 4.0}, {}, load_recipe("path").make_trainer
 
     def make_scripted(settings, parts):
         trainer = make(settings, parts)
@@ -156,7 +156,7 @@ def test_training_ends_where_validation_no_longer_improves_with_the_best_weights
         trainer.validate = validate
         return trainer
 
-    monkeypatch.setattr(KINDS["path"], "make_trainer", make_scripted)
+    monkeypatch.setattr(load_recipe("path"), "make_trainer", make_scripted)
     train(small_settings("path", data, tmp_path / "run", patience=patience))
     card = checkpoints.read_card(tmp_path / "run" / "model.json")
     assert card.training["curve"][-1]["step"] == last
@@ -198,7 +198,7 @@ def test_an_interruption_is_explained_by_the_last_checkpoint(data, tmp_path, mon
 
     words = ["train", "lstm-gmm", "--data", data, "-o", tmp_path / "run", "--steps", 6, "--batch", 4, "--window", 20]
     words += ["--width", 8]
-    with killing(KINDS["lstm-gmm"], 3):
+    with killing(load_recipe("lstm-gmm"), 3):
         train(small_settings("lstm-gmm", data, tmp_path / "run", checkpoint_minutes=0.0, shape=None, width=8))
     monkeypatch.setattr(GradientTrainer, "train_step", interrupt)
     assert run(*words, "--resume") == 130

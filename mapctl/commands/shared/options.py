@@ -30,7 +30,6 @@ MaybeSpeed = Annotated[str | None, arg(metavar="M/S|ARC:M/S,...")]
 MaybeFile = Annotated[Path | None, arg(metavar="FILE")]
 MaybeCurve = Annotated[str | None, arg(metavar="CURVE")]
 MaybeNumber = Annotated[float | None, arg(metavar="NUMBER")]
-MaybeCount = Annotated[int | None, arg(metavar="N")]
 MaybeName = Annotated[str | None, arg(metavar="NAME")]
 _MARKERS = """For positions (.c3d, .trc, .csv, .npy) with names of no known marker set: a TOML that names the markers
 whose mean is a joint's centre, as leftLowerLeg = ["LKNE", "LKNM"]."""
