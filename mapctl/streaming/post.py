@@ -12,8 +12,6 @@ from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from typing import Any
 
-_MAX_WAITING = 3000  # frames that wait: beyond them the oldest is dropped
-
 
 @dataclass(frozen=True)
 class StreamStatistics:
@@ -25,7 +23,7 @@ class StreamStatistics:
     largest_lateness_ms: float = 0.0
     """Largest time from when a frame was due to when it was sent, milliseconds."""
     not_sent: int = 0
-    """Frames that the system would not send, or for which there was no room."""
+    """Frames that the system would not send."""
     fault: str = ""
     """Why the first of those was not sent."""
 
@@ -45,9 +43,6 @@ class _Post:
 
     def put(self, character: int, due: float, packets: Sequence[bytes]) -> None:
         heapq.heappush(self._waiting, (due, next(self._counter), character, packets))
-        if len(self._waiting) > _MAX_WAITING:
-            heapq.heappop(self._waiting)
-            self._count_unsent("too many frames waited")
 
     def forget(self, character: int) -> None:
         self._waiting = [frame for frame in self._waiting if frame[2] != character]
@@ -61,7 +56,8 @@ class _Post:
                 for packet in packets:
                     self._socket.sendto(packet, self._receivers[character])
             except OSError as error:  # nobody there, or no room: the next frame comes anyway
-                self._count_unsent(error.strerror or str(error))
+                known, why = self.statistics, error.strerror or str(error)
+                self.statistics = replace(known, not_sent=known.not_sent + 1, fault=known.fault or why)
             else:
                 self._count_sent(time.perf_counter() - due)
 
@@ -73,10 +69,6 @@ class _Post:
             late=known.late + (lateness > self._late_seconds),
             largest_lateness_ms=max(known.largest_lateness_ms, 1000 * lateness),
         )
-
-    def _count_unsent(self, why: str) -> None:
-        known = self.statistics
-        self.statistics = replace(known, not_sent=known.not_sent + 1, fault=known.fault or why)
 
 
 def run_post(connection: Connection, family: int, receivers: Sequence[tuple[str, int]], late_seconds: float) -> None:

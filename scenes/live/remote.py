@@ -7,7 +7,7 @@ import re
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mapctl.errors import MapctlError, RequestError
 from mapctl.streaming.messages import Message, is_number
@@ -45,10 +45,8 @@ class Order:
     """Index of the character, from 0."""
     name: str
     """Name of the order, as `speed` or `hand/left`, or a group of labels, as `style`."""
-    numbers: tuple[float, ...] = ()
-    """Its numbers, finite."""
-    word: str | None = None
-    """Its label, if it is about a group of labels."""
+    arguments: tuple[Any, ...] = ()
+    """Its numbers, finite; the label of an order about a group of labels."""
 
 
 def read_order(message: Message, *, characters: int, groups: Iterable[str]) -> Order:
@@ -63,9 +61,18 @@ def read_order(message: Message, *, characters: int, groups: Iterable[str]) -> O
     number = int(found["character"] or 1)
     if not 1 <= number <= characters:
         raise RequestError(f"{shown}: there is no character {number}")
+    given = message.arguments
     if name in groups:
-        return Order(number - 1, name, word=_read_word(shown, message.arguments))
-    return Order(number - 1, name, _read_numbers(shown, _NUMBERS[name], message.arguments))
+        if len(given) != 1 or not isinstance(given[0], str):
+            raise RequestError(f"{shown} takes one word")
+        return Order(number - 1, name, given)
+    counts = _NUMBERS[name]
+    if len(given) not in counts:
+        words = " or ".join("no" if count == 0 else str(count) for count in counts)
+        raise RequestError(f"{shown} takes {words} number{'' if counts[-1] == 1 else 's'}, not {len(given)}")
+    if not all(map(is_number, given)):
+        raise RequestError(f"{shown} takes finite numbers, not {_shorten(given)}")
+    return Order(number - 1, name, given)
 
 
 def keep_latest(orders: Iterable[Order]) -> list[Order]:
@@ -75,22 +82,6 @@ def keep_latest(orders: Iterable[Order]) -> list[Order]:
         found.pop((order.character, order.name), None)
         found[order.character, order.name] = order
     return list(found.values())
-
-
-def _read_word(shown: str, arguments: Sequence[object]) -> str:
-    if len(arguments) != 1 or not isinstance(arguments[0], str):
-        raise RequestError(f"{shown} takes one word")
-    return arguments[0]
-
-
-def _read_numbers(shown: str, counts: Sequence[int], arguments: Sequence[object]) -> tuple[float, ...]:
-    if len(arguments) not in counts:
-        words = " or ".join("no" if count == 0 else str(count) for count in counts)
-        raise RequestError(f"{shown} takes {words} number{'' if counts[-1] == 1 else 's'}, not {len(arguments)}")
-    found = tuple(float(value) for value in arguments if is_number(value))  # pyright: ignore[reportArgumentType]
-    if len(found) < len(arguments):
-        raise RequestError(f"{shown} takes finite numbers, not {_shorten(arguments)}")
-    return found
 
 
 def _shorten(value: object) -> str:
@@ -128,12 +119,12 @@ class RemoteCommands:
 
     def _act(self, character: ShownCharacter, order: Order) -> list[str]:
         """Do what one order asks for; return what could not be done as it was asked."""
-        app, numbers = self._app, order.numbers
+        app, numbers = self._app, order.arguments
         match order.name:
             case "reset":
                 app.restart()
             case "pause":
-                app.set_paused(numbers != (0.0,))
+                app.set_paused(numbers != (0,))
             case "goto":
                 x, _, z = read_position((numbers[0], 0.0, numbers[1]))
                 within = numbers[2] if len(numbers) > 2 else _DEFAULT_WITHIN
@@ -144,9 +135,9 @@ class RemoteCommands:
                 others = {hand: at for hand, at in character.wanted.reach.items() if hand != _HANDS[order.name]}
                 app.aim(character, reach=others | ({_HANDS[order.name]: read_position(numbers)} if numbers else {}))
             case "speed":
-                return app.change(character, speed=numbers[0])
+                return app.change(character, speed=float(numbers[0]))
             case "heading" | "facing":
                 return app.change(character, **{order.name: read_degrees(numbers[0]) if numbers else None})
             case group:
-                app.label(character, group, order.word or "")
+                app.label(character, group, *numbers)
         return []

@@ -28,7 +28,7 @@ def read(address: str, *arguments: object, characters: int = 3) -> Order:
         ("/mapctl/speed", (1.5,), Order(0, "speed", (1.5,))),
         ("/mapctl/3/heading", (90.0,), Order(2, "heading", (90.0,))),
         ("/mapctl/reset", (), Order(0, "reset")),
-        ("/mapctl/style", ("old",), Order(0, "style", word="old")),
+        ("/mapctl/style", ("old",), Order(0, "style", ("old",))),
         ("/mapctl/2/hand/left", (0.1, 1.2, 3.0), Order(1, "hand/left", (0.1, 1.2, 3.0))),
         ("/mapctl/goto", (1.0, 2.0, 1.5), Order(0, "goto", (1.0, 2.0, 1.5))),
     ],
