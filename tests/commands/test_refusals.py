@@ -387,7 +387,7 @@ CASES = {
     f"{TRAIN} --steps 0": "steps must be at least 1, got 0",
     f"{TRAIN} --batch 1": "batch must be at least 2, got 1",
     f"{TRAIN} --width 0": "Unrecognized options: --width",
-    "live --character hero.glb --character hero.glb": "--character is given 2 times for 1 of --characters",
+    "live --character hero.glb --rig mixamo": "--character moves on its own bones; leave it or --rig out",
 }
 """Command lines, and a part of the message of each."""
 
