@@ -25,6 +25,7 @@ from helpers import run, walk, write_corpus
 from tiny_denoiser import save_tiny_denoiser
 from tiny_infiller import save_tiny_infiller
 from tiny_prior import save_tiny_prior
+from tiny_transformer import save_tiny_transformer
 
 FILE = Path(__file__).with_name("golden.json")
 _NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?(?![\w.])")
@@ -72,24 +73,25 @@ COMMANDS = {
     "denoise with a prior": "denoise noisy.bvh -o clean-2.bvh --denoiser denoiser.safetensors --prior tiny.safetensors"
     " --mask mask.csv --capture video",
     "denoise causal": "denoise noisy.bvh -o causal.bvh --denoiser denoiser.safetensors --causal",
-    "infill": "infill walk.bvh -o filled.bvh --gap 10:22 --inbetweener infiller.safetensors --report filled.json",
+    "infill": "infill walk.bvh -o filled.bvh --gap 10:22 --inbetweener transformer.safetensors --report filled.json",
     "infill joints": "infill walk.bvh -o arm.bvh --gap 5:25 --joints leftLowerArm,leftHand"
-    " --inbetweener infiller.safetensors --prior tiny.safetensors",
-    "infill along a curve": "infill walk.bvh -o led.bvh --gap 10:30 --curve line:2 --inbetweener infiller.safetensors",
+    " --inbetweener transformer.safetensors --prior tiny.safetensors",
+    "infill along a curve": "infill walk.bvh -o led.bvh --gap 10:30 --curve line:2"
+    " --inbetweener transformer.safetensors",
     "infill by lines": "infill walk.bvh -o lines.bvh --gap 10:22 --method slerp --no-refine",
     "infill by rollouts": "infill walk.bvh -o rolled.bvh --gap 10:22 --method rollouts"
-    " --inbetweener infiller.safetensors --prior tiny.safetensors --seed 2",
-    "tween": "tween walk.bvh -o tweened.bvh --keyframes 0,14,29 --inbetweener infiller.safetensors"
+    " --inbetweener transformer.safetensors --prior tiny.safetensors --seed 2",
+    "tween": "tween walk.bvh -o tweened.bvh --keyframes 0,14,29 --inbetweener transformer.safetensors"
     " --report tweened.json",
-    "tween file": "tween keys.toml -o keyed.bvh --inbetweener infiller.safetensors --prior tiny.safetensors",
+    "tween file": "tween keys.toml -o keyed.bvh --inbetweener transformer.safetensors --prior tiny.safetensors",
     "tween timing": "tween walk.bvh -o timed.bvh --keyframes 0,14,29 --inbetweener infiller.safetensors"
     " --suggest-timing --method infiller --no-refine",
-    "tween variations": "tween walk.bvh -o several.bvh --keyframes 0,12 --inbetweener infiller.safetensors"
+    "tween variations": "tween walk.bvh -o several.bvh --keyframes 0,12 --inbetweener transformer.safetensors"
     " --prior tiny.safetensors --variations 2",
     "tween slerp": "tween walk.bvh -o slerped.bvh --keyframes 0,14,29 --method slerp --no-refine",
     "blend": "blend walk.bvh --from other.bvh --joints leftHand --frames 5:15 --at 12 -o blended.bvh"
-    " --inbetweener infiller.safetensors",
-    "chain": "chain walk.bvh other.bvh -o chained.bvh --piece 12 --gap 6:8 --inbetweener infiller.safetensors",
+    " --inbetweener transformer.safetensors",
+    "chain": "chain walk.bvh other.bvh -o chained.bvh --piece 12 --gap 6:8 --inbetweener transformer.safetensors",
     "convert": "convert walk.bvh canonical.npz --rig canonical",
     "convert rate": "convert walk.bvh slower.glb --fps 24",
     "measure": "measure follow.bvh --curve wave:0.5x2 --reference walk.bvh --json",
@@ -99,7 +101,6 @@ COMMANDS = {
     "train infiller": "train infiller --data data -o infiller --steps 2 --batch 2 --window 32 --seed 2",
     "train lstm-gmm, paper": "train lstm-gmm --data data -o paper --steps 2 --batch 2 --window 20 --width 8 --seed 2"
     " --paper",
-    "train infiller, image": "train infiller --data data -o image --steps 1 --batch 2 --window 32 --architecture image",
 }
 """By name, a command line that is run in the folder `prepare` makes, one after the other."""
 
@@ -108,6 +109,7 @@ def prepare(folder: Path) -> None:
     """Small models and inputs."""
     save_tiny_prior(folder / "tiny.safetensors")
     save_tiny_infiller(folder / "infiller.safetensors", drawn=0.02)
+    save_tiny_transformer(folder / "transformer.safetensors", drawn=0.02)
     save_tiny_denoiser(folder / "denoiser.safetensors", drawn=0.02)
     write_corpus(folder / "data", count=4, frames=160)
     from captures import noisy, on_rig

@@ -1,4 +1,4 @@
-"""An infiller of a few kilobytes: untrained it draws straight lines, with drawn weights something else."""
+"""An infiller of a few kilobytes: it proposes about the T-pose, the farther from it the wider its weights are drawn."""
 
 from pathlib import Path
 
@@ -10,20 +10,20 @@ from mapctl.inbetweening import PositionImage
 from mapctl.skeleton import CANONICAL
 from priors.infiller import ConvInfiller, InfillerConfig, InfillerNetwork
 
-CONFIG = InfillerConfig(widths=(8, 8, 8, 8, 8))
-_SPREAD = 0.1  # metres: what one unit of a place is
+CONFIG = InfillerConfig(widths=(2, 2, 2, 2, 2))
 
 
 def network(*, drawn: float = 0.0, seed: int = 0, config: InfillerConfig = CONFIG) -> InfillerNetwork:
-    """Layers that are nil untrained are drawn with this spread."""
+    """Weights of the last layer are drawn with this share of their usual spread."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        result = InfillerNetwork(config)
-        for parameter in result.parameters():
-            if drawn and not parameter.any():
-                torch.nn.init.normal_(parameter, std=drawn)
-    result.std.fill_(_SPREAD)
-    return result.eval().requires_grad_(False)
+        result = InfillerNetwork(config).requires_grad_(False)
+    rest = torch.tensor([[0.0, 0.0, 0.0, 1.0]]).expand(CANONICAL.num_joints, 4)
+    result.std.fill_(0.1)
+    height = torch.tensor([0.0, 0.95, 0.0])
+    result.mean.copy_(kinematics.forward_kinematics(CANONICAL.offsets.float(), CANONICAL.parents, height, rest)[0])
+    result.net.up_two[-1].weight.mul_(drawn)
+    return result.eval()
 
 
 def tiny_infiller(*, drawn: float = 0.0, seed: int = 0, config: InfillerConfig = CONFIG) -> ConvInfiller:

@@ -8,7 +8,6 @@ import torch
 from helpers import bandai_skeleton, generator, walk
 from performers import TOES, Performer
 from rig_maker import Make, make, names_of
-from tiny_infiller import tiny_infiller
 
 from controllers.inbetweening.blend import LimbTransfer, blend
 from controllers.inbetweening.infill import chain
@@ -38,7 +37,7 @@ def test_frames_are_the_other_clips_own(own, other):
     start, stop, at = round(0.5 * other), round(1.0 * other), 2 * own
     still = replace(waving(own), local_quat_xyzw=waving(own).local_quat_xyzw[:1].expand(4 * own, -1, -1))
     transfer = LimbTransfer(("lefthand",), start, stop, at)
-    done = blend(still, waving(other), transfer, tiny_infiller(), refinement=None).motion
+    done = blend(still, waving(other), transfer, SlerpInbetweener(), refinement=None).motion
     arm = (done.joint_positions()[:, HAND] - done.joint_positions()[:, ARM])[at : at + round(0.5 * own)]
     wanted = 0.5 + torch.arange(len(arm), dtype=torch.float64) / own
     torch.testing.assert_close(torch.atan2(-arm[:, 1], arm[:, 0]), wanted, atol=1e-3, rtol=0)
@@ -60,7 +59,7 @@ def test_a_borrowed_limb_goes_there_and_comes_back_as_bodies_do(fps, margin):
         motion,
         source,
         LimbTransfer(("leftHand",), 8, 28, 70 * fps // 30, margin=margin),
-        tiny_infiller(),
+        SlerpInbetweener(),
         refinement=None,
     )
     own, theirs, result = peaks_of(motion), peaks_of(source), peaks_of(done.motion)

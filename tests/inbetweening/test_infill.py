@@ -10,6 +10,7 @@ from helpers import generator, quat_xyzw, random_motion, tiny_density, walk
 from methods import by_method
 from tiny_infiller import tiny_infiller
 from tiny_path import ToldPath, tiny_path
+from tiny_transformer import tiny_transformer
 
 from controllers import retraced
 from controllers.inbetweening.infill import infill
@@ -211,7 +212,7 @@ def still(frames):
 
 def test_a_standing_character_stays():
     motion = still(121)
-    wandering = tiny_infiller(drawn=0.05)
+    wandering = tiny_transformer(drawn=0.5)
     done = tween(motion, Keys((0, 120)), AutoInbetweener(wandering, [tiny_density()]))
     assert [source.by for source in done.sources] == [STANDING_STILL]
     away = (done.motion.root_position - motion.root_position).norm(dim=-1)

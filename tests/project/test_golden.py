@@ -17,7 +17,6 @@ LONG = {
     "tween variations",
     "tween best",
     "train lstm-gmm, paper",
-    "train infiller, image",
 }
 """A quicker one of the same command is compared in any case; `python tests/golden.py` compares all."""
 ALL = [pytest.param(name, marks=pytest.mark.slow if name in LONG else ()) for name in golden.COMMANDS]

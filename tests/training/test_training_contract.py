@@ -215,7 +215,6 @@ def test_an_interruption_is_explained_by_the_last_checkpoint(data, tmp_path, mon
         ("lstm-gmm", "--paper --width 8", lambda s: (s.find_config().width, s.find_config().retain) == (8, 0.0)),
         ("refiner", "--density mine --paper", lambda s: (s.density, s.config.memory) == ("mine", 1000)),
         ("denoiser", "--width 8", lambda s: s.find_config().width == 8),
-        ("infiller", "--architecture image", lambda s: s.find_config().architecture == "image"),
         ("path", "--batch 6 --window 64", lambda s: (s.batch, s.window) == (6, 64)),
         ("tweener", "--paper --labels (a)", lambda s: (s.find_config().skips, s.labels) == (False, "(a)")),
         ("stitcher", "--init x --device cpu", lambda s: (s.init, s.device) == ("x", "cpu")),

@@ -5,19 +5,17 @@ section 3.3, keys far apart and poses known in part.
 """
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
-from tyro.conf import arg
 
 from mapctl.inbetweening import PositionImage
 from mapctl.inbetweening.partial_motion import PartialMotion, interpolate_partial_motion
 from mapctl.inbetweening.position_image import mirror_positions
 from mapctl.pose import BodyPose
-from mapctl.skeleton import CANONICAL, TOE_JOINTS
+from mapctl.skeleton import CANONICAL
 from priors.infiller import ConvInfiller, InfillerConfig, InfillerNetwork
 from priors.training.data import Corpus, Split
 from priors.training.gaps import InbetweenerTrainer
@@ -27,15 +25,9 @@ from priors.training.windows import PoseWindows, draw_length
 
 _SHORTEST_WINDOW = 16  # frames
 _REST = [[0.0, 0.0, 0.0, 1.0]] * CANONICAL.num_joints
-_ERROR_OFFSET_CM = 0.5  # cm that the guess may be off by before a window's weight falls
-_MAX_ERROR_CM = 4.0  # cm beyond which it falls no more
 _MIN_STD = 0.05  # metres: of a position that hardly moves, as the hips' over their own reference
 _CHUNK_FRAMES = 50_000
-
-# Weights beside that of the position error, cm, which is 1.
-_PACE = 1.0  # of the joints' velocity error, cm a frame
-_FEET = 0.05  # of the planted toes' error in velocity, cm a frame
-_CONTACTS = 0.1  # of the contacts' cross entropy, nats
+_CONTACTS = 0.1  # weight of the contacts' cross entropy, nats; that of the position error, cm, is 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +37,6 @@ class InfillerSettings(NetworkSettings):
     kind = "infiller"
     used_by = "use it with --method infiller --inbetweener"
     ours = InfillerConfig()
-    shape_options = ("architecture",)
     least_window = _SHORTEST_WINDOW
 
     steps: Count = 8_000
@@ -54,8 +45,6 @@ class InfillerSettings(NetworkSettings):
     """Frames a step; windows of one step are equally long."""
     window: Count = 160
     """Frames of the longest window; the shortest have 16, and as many are drawn of each octave."""
-    architecture: Annotated[Literal["skips", "image"] | None, arg(metavar="skips|image")] = None
-    """skips is ours, image that of Kaufmann et al. 2020."""
 
     def make_trainer(self, parts: Split) -> "InfillerTrainer":
         return InfillerTrainer(self, parts.train)
@@ -100,39 +89,12 @@ def show_known(
 def compute_infiller_losses(
     network: InfillerNetwork, motion: PartialMotion, hidden: PartialMotion
 ) -> dict[str, Tensor]:
-    """The loss, and in plain units the errors that add up to it.
-
-    L1 over the whole motion (Kaufmann et al. 2020, section 3.3), window by window divided by the number of coordinates
-    that had to be filled: two joints that are lost count as much as a gap. A network that keeps what is known is so
-    judged on what is not, an autoencoder on everything. A window in which the guess would do counts for more, or a
-    network learns to fidget where a body stands still.
-    """
+    """Compute the loss, and in plain units the errors that add up to it: L1 over the whole motion (Kaufmann et al.
+    2020, section 3.3)."""
     image, wanted = show_known(motion, hidden)
     proposed, lacking = network(image), ~image.known
-    filled = lacking if network.keeps_observed else torch.ones_like(lacking)
     wrong = 100 * (proposed.positions - wanted)
-    weight = _weigh_windows(image.positions, wanted, lacking) / (3 * filled.sum(dim=(1, 2)).clamp_min(1))
-    miss = (weight * (wrong.abs().sum(-1) * filled).sum(dim=(1, 2))).mean()
-    slip = torch.diff(wrong, dim=1)
-    pace = (weight * slip.abs().sum(dim=(1, 2, 3))).mean()
-    planted = motion.contacts[:, 1:] * motion.contacts[:, :-1]
-    feet = (slip[..., list(TOE_JOINTS), :].abs().sum(-1) * planted).sum() / planted.sum().clamp_min(1)
-    unsure = filled[..., list(TOE_JOINTS)]
-    guessed = cross_entropy(proposed.contacts, motion.contacts, reduction="none")
-    contacts = (guessed * unsure).sum() / unsure.sum().clamp_min(1)
-    loss = miss + _PACE * pace + _FEET * feet + _CONTACTS * contacts
+    position, contacts = wrong.abs().mean(), cross_entropy(proposed.contacts, motion.contacts)
     error = ((wrong - wrong[..., :1, :]).norm(dim=-1).detach() * lacking).sum() / lacking.sum().clamp_min(1)
-    return {
-        "loss": loss,
-        "position": miss,
-        "pace": pace,
-        "feet_cm_frame": feet,
-        "contacts_nats": contacts,
-        "error_cm": error,
-    }
-
-
-def _weigh_windows(guess: Tensor, wanted: Tensor, lacking: Tensor) -> Float[Tensor, " batch"]:
-    """Weigh windows: the farther off the initial guess (mean over coordinates, cm), the less; 1 at 2 cm."""
-    off = (100 * (guess - wanted).abs().mean(-1) * lacking).sum(dim=(1, 2)) / lacking.sum(dim=(1, 2)).clamp_min(1)
-    return (2 + _ERROR_OFFSET_CM) / (off.clamp(max=_MAX_ERROR_CM) + _ERROR_OFFSET_CM)
+    loss = position + _CONTACTS * contacts
+    return {"loss": loss, "position": position, "contacts_nats": contacts, "error_cm": error}
