@@ -291,12 +291,6 @@ class Inbetweener(Protocol):
         return self
 
     @property
-    def takes_partial_keys(self) -> bool:
-        """Whether it makes a motion through effector targets, and through hips that are known alone in single frames.
-        Default: no; such keys are then hidden from it, and reached by the motion that it proposes without them."""
-        return False
-
-    @property
     def has_style(self) -> bool:
         """Whether it is conditioned on motion DNA; gaps that others would do as well then go to it. Default: no."""
         return False

@@ -303,11 +303,6 @@ class PoseTransformer(checkpoints.NetworkModel[PoseTransformerNetwork], Inbetwee
 
     kind, parts = "pose-transformer", (PoseTransformerNetwork, PoseTransformerConfig)
 
-    @property
-    def takes_partial_keys(self) -> bool:
-        """It is conditioned on positions of hands, feet and hips in single frames."""
-        return True
-
     @torch.no_grad()
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
         """Propose the mean of the outputs for the query and for its mirror image, without sampling.
@@ -319,8 +314,6 @@ class PoseTransformer(checkpoints.NetworkModel[PoseTransformerNetwork], Inbetwee
         origin = query.motion.root_position[known[0] if len(known) else 0].clone()
         origin[1] = 0.0
         near = replace(query, motion=replace(query.motion, root_position=query.motion.root_position - origin))
-        if (targets := query.effector_targets) is not None:
-            near = replace(near, effector_targets=replace(targets, positions=targets.positions - origin))
         motion = self._show(near)
         gaps = _find_silent_gaps(query)
         longest = max((stop - start for start, stop in gaps if stop - start <= MAX_GAP_FRAMES), default=0)
@@ -355,19 +348,14 @@ class PoseTransformer(checkpoints.NetworkModel[PoseTransformerNetwork], Inbetwee
         heading, tilt = rotations.split_heading(body.local_quat_xyzw[:, 0])
         quats = torch.cat([tilt[:, None], body.local_quat_xyzw[:, 1:]], dim=1)
         nowhere = torch.zeros_like(missing.root)
-        targets, wanted = torch.zeros(len(quats), len(EFFECTORS), 3), nowhere[:, None].expand(-1, len(EFFECTORS))
         known = KnownParts(
             ~missing.joints[None],
             ~missing.joints[None, :, 0],
             ~missing.root[None],
             ~missing.root[None],
             (missing.root if query.keep_trajectory else nowhere)[None],
-            wanted[None],
+            nowhere[None, :, None].expand(-1, -1, len(EFFECTORS)),
         )
-        if query.effector_targets is not None:
-            targets = (query.effector_targets.positions[:, list(EFFECTORS)] / query.scale).float()
-            wanted = query.effector_targets.wanted[:, list(EFFECTORS)][None] & ~known.positions[..., list(EFFECTORS)]
-            known = replace(known, effectors=wanted)
         toes = body.joint_positions()[:, list(TOE_JOINTS)] / query.scale
         planted = torch.where(
             known.positions[0][:, list(TOE_JOINTS)], contacts.detect_contacts(toes, PRIOR_FPS).float(), 0.5
@@ -377,7 +365,7 @@ class PoseTransformer(checkpoints.NetworkModel[PoseTransformerNetwork], Inbetwee
             rotations.unwrap_angle(heading).float()[None],
             quats.float()[None],
             planted[None],
-            targets[None],
+            torch.zeros(1, len(quats), len(EFFECTORS), 3),
             (body.skeleton.offsets / query.scale).float()[None],
             known,
         )
@@ -417,8 +405,6 @@ def _lay_windows(unknown: Bool[Tensor, " frames"], longest: int) -> Iterator[tup
 def _find_silent_gaps(query: GapQuery) -> list[tuple[int, int]]:
     """Return first frames and one past the last of gaps in which nothing is given."""
     silent = query.nothing_known
-    if query.effector_targets is not None:
-        silent = silent & ~query.effector_targets.wanted.any(dim=1)
     if query.keep_trajectory:
         silent = silent & ~query.missing.root
     return [(start, stop) for _, start, stop in true_intervals(silent[:, None])]

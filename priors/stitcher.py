@@ -6,7 +6,7 @@ tensors with a leading axis of two, forward first, and share no weights. Each si
 side's latest frame, and where and when that is. An LSTM and heads give the distribution of the latent now and on
 arrival, and a decoder LSTM with experts gated by the phase gives the next frame. The sides are then joined: the overlap
 is blended, and what they disagree on in position is spread over the whole transition, where the paper's blend of the
-overlap alone would slide both feet. Constraints within a gap are met by Gauss-Newton over the latent (`fit_shared`).
+overlap alone would slide both feet.
 
 Departures from what is printed:
 
@@ -23,9 +23,9 @@ Departures from what is printed:
 """
 
 import math
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import pairwise
 from typing import ClassVar
@@ -40,9 +40,7 @@ from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, encode, mirror_features, reversed_features
 from mapctl.inbetweening import GapQuery, Proposal
 from mapctl.inbetweening.query import INTERPOLATION, GapSource
-from mapctl.kinematics import forward_kinematics, heading
 from mapctl.motion import Motion
-from mapctl.numerics.gaussian import averaging_matrix
 from mapctl.numerics.intervals import true_intervals
 from mapctl.pose import BodyPose
 from mapctl.protocols import Inbetweener
@@ -516,11 +514,6 @@ class Ends:
             present.append((torch.arange(context) >= lead).float().expand(len(known), -1))
         return Ends(torch.stack(sides), torch.stack(present), position, turn)
 
-    def repeat(self, count: int) -> "Ends":
-        """Return so many copies of the one pair of poses."""
-        features, present = self.features.repeat(1, count, 1, 1), self.present.repeat(1, count, 1)
-        return Ends(features, present, self.position.repeat(count, 1), self.turn.repeat(count))
-
     def with_mirror_image(self) -> "Ends":
         """Return these pairs of poses, then their mirror images."""
         return Ends(
@@ -637,14 +630,9 @@ class Joined:
     apart: Float[Tensor, " batch"]  # mean distance of the sides' joints amid their overlap, metres (MMPE)
 
     @property
-    def finite(self) -> Bool[Tensor, " batch"]:
-        """Whether all numbers of a motion are finite."""
-        return self.root_position.isfinite().flatten(1).all(dim=1) & self.quats.isfinite().flatten(1).all(dim=1)
-
-    def row(self, number: int) -> "Joined":
-        """Return one motion, as a batch of one."""
-        part = slice(number, number + 1)
-        return Joined(self.root_position[part], self.quats[part], self.contacts[part], self.apart[part])
+    def finite(self) -> bool:
+        """Whether all numbers are finite."""
+        return bool(self.root_position.isfinite().all() & self.quats.isfinite().all())
 
 
 def join_sides(sides: Sides) -> Joined:
@@ -685,131 +673,6 @@ def _blend(one: Tensor, other: Tensor, first: int, last: int) -> Tensor:
     return torch.cat([one[:, : first - 1], mixed, other[:, count:]], dim=1)
 
 
-CHUNK = 16
-"""Draws at once: batches of one size are rounded alike, so that the first draws do not depend on the count."""
-_LARGEST_SEED = 2**63
-_ROUNDS, _DIFFERENCE = 2, 0.25  # the second in standard deviations of the prior
-_SHARES = (0.25, 0.5, 0.75, 1.0, 1.25)  # of a step
-
-
-def fit_shared(
-    make: Callable[[Float[Tensor, "batch shared"]], Joined],
-    measure: Callable[[Joined], Float[Tensor, "batch residuals"]],
-    centre: Float[Tensor, " shared"],
-    spread: float,
-) -> Joined:
-    """Fit what both sides share, in standard deviations of the prior, to residuals in theirs, by Gauss-Newton;
-    with a sample as the centre, randomise-then-optimise (Bardsley et al. 2014).
-
-    The energy counts distances from the `centre` in units of `spread`. Returns the motion with the least energy of all
-    that were generated, as a batch of one: that of the centre where no step helps, or where nothing finite is near it.
-    """
-    best, fitted = centre, make(centre[None])
-    for _ in range(_ROUNDS):
-        residuals = measure(make(torch.cat([best[None], best + _DIFFERENCE * torch.eye(len(best))])))
-        here = residuals[0]
-        jacobian = spread * ((residuals[1:] - here) / _DIFFERENCE).T
-        away = (best - centre) / spread
-        system = jacobian @ jacobian.T + torch.eye(len(here))
-        # Of  |r + J d|^2 + |a + d|^2  the least is at  d = -a - J' (J J' + 1)^-1 (r - J a).
-        step = -away - jacobian.T @ torch.linalg.solve(system, here - jacobian @ away)
-        tried = best + spread * torch.tensor((0.0, *_SHARES))[:, None] * step
-        if not bool(tried.isfinite().all()):
-            break
-        generated = make(tried)
-        energy = measure(generated).square().sum(dim=1) + ((tried - centre) / spread).square().sum(dim=1)
-        least = int(torch.where(energy.isfinite() & generated.finite, energy, torch.inf).argmin())
-        best, fitted = tried[least], generated.row(least)
-    return fitted
-
-
-_SIGMA_HAND, _SIGMA = 0.1, 0.02
-"""Metres of a hand, and of a foot, the hips or a trajectory: what bends away without the rest of the body. Arms bend by
-themselves: with less for hands the rest of the body comes farther from mocap that they were taken from."""
-_HANDS = CANONICAL.indices(("leftHand", "rightHand"))
-_FACING_ARM = 0.3  # metres by which a radian counts of how the hips face
-_SWAY_FRAMES = 5.0  # frames at PRIOR_FPS, sigma, of the average in which the hips follow a trajectory
-_TRAJECTORY_STRIDE = 6  # frames from one residual of a trajectory to the next
-
-
-@dataclass(frozen=True, eq=False)
-class Constraints:
-    """Constraints on the frames of one gap, on the canonical skeleton, seen from the pose before it."""
-
-    positions: Float[Tensor, "frames joints 3"]  # positions that joints are to have, metres
-    wanted: Bool[Tensor, "frames joints"]  # whether a joint is to have one
-    facing: Float[Tensor, " faced"]  # headings that the hips are to have, radians
-    faced: Int[Tensor, " faced"]  # frames in which they are to have them
-    trajectory: Float[Tensor, "frames 2"] | None  # of the hips on the ground, metres; they may sway
-
-    @staticmethod
-    def of(query: GapQuery, start: int, stop: int) -> "Constraints | None":
-        """Collect the constraints of a query between frames that are known on both sides; None without any."""
-        part, targets = slice(start, stop), query.effector_targets
-        hips = query.root_only_keys[part]
-        given = query.keep_trajectory or bool(hips.any()) or (targets is not None and bool(targets.wanted[part].any()))
-        if not given:
-            return None
-        body = query.to_unit_size(query.motion)
-        facing = heading(body.local_quat_xyzw[start - 1, 0])
-        origin = body.root_position[start - 1] * torch.tensor([1.0, 0.0, 1.0]).double()
-
-        def see(positions: Tensor) -> Tensor:
-            return rotations.rotate_about_y(positions - origin, -facing.expand(positions.shape[:-1]))
-
-        points = torch.zeros(stop - start, CANONICAL.num_joints, 3)
-        wanted = torch.zeros(points.shape[:2], dtype=torch.bool)
-        root = see(body.root_position[part]).float()
-        if targets is not None:
-            points, wanted = see(targets.positions[part] / query.scale).float(), targets.wanted[part].clone()
-        points[:, 0], wanted[:, 0] = root, hips
-        turned = rotations.wrap_angle(heading(body.local_quat_xyzw[part, 0]) - facing).float()
-        faced = hips.nonzero()[:, 0]
-        return Constraints(points, wanted, turned[faced], faced, root[:, ::2] if query.keep_trajectory else None)
-
-    def measure(self, joined: Joined) -> Float[Tensor, "batch residuals"]:
-        """Measure by how much motions miss each constraint along each axis, in standard deviations."""
-        points, facing, trajectory = self._measure(joined)
-        hands = torch.isin(self.wanted.nonzero()[:, 1], torch.tensor(_HANDS))
-        sigma = torch.where(hands, _SIGMA_HAND, _SIGMA)[:, None]
-        parts = (points / sigma, facing / _SIGMA, trajectory / _SIGMA)
-        return torch.cat([part.flatten(1) for part in parts], dim=1)
-
-    def measure_farthest(self, joined: Joined) -> float:
-        """Measure the largest distance of one motion to a constraint, metres."""
-        return max((float(part[0].norm(dim=-1).max()) for part in self._measure(joined) if part.numel()), default=0.0)
-
-    def lay_along(self, joined: Joined) -> Joined:
-        """Move motions along the trajectory, if there is one."""
-        if self.trajectory is None:
-            return joined
-        root = joined.root_position - rotations.lift_ground(self._follow(joined.root_position, self.trajectory))
-        return Joined(root, joined.quats, joined.contacts, joined.apart)
-
-    def _measure(
-        self, joined: Joined
-    ) -> tuple[Float[Tensor, "batch targets 3"], Float[Tensor, "batch faced 1"], Float[Tensor, "batch points 2"]]:
-        """Measure by how much motions miss positions, headings and points of the trajectory, metres."""
-        root = joined.root_position
-        positions, _ = forward_kinematics(CANONICAL.offsets.to(root), CANONICAL.parents, root, joined.quats)
-        turned = rotations.wrap_angle(heading(joined.quats[:, self.faced, 0]) - self.facing)
-        off = root[:, :0, ::2] if self.trajectory is None else self._follow(root, self.trajectory)
-        points = off[:, _TRAJECTORY_STRIDE // 2 :: _TRAJECTORY_STRIDE]
-        return (positions - self.positions)[:, self.wanted], _FACING_ARM * turned[..., None], points
-
-    @staticmethod
-    def _follow(
-        root: Float[Tensor, "batch frames 3"], trajectory: Float[Tensor, "frames 2"]
-    ) -> Float[Tensor, "batch frames 2"]:
-        """Measure how far the hips, averaged over their sway, are off the trajectory: by nothing in the frames before
-        and after, which are known."""
-        off = torch.nn.functional.pad(root[..., ::2] - trajectory, (0, 0, 1, 1))
-        # Beyond the known frames it goes on turned round, so that its average there is nothing, too.
-        turned, count = -off[:, 1:-1].flip(1), len(trajectory)
-        whole = torch.cat([turned, off, turned], dim=1)
-        return averaging_matrix(whole.shape[1], _SWAY_FRAMES, off.dtype)[count + 1 : 2 * count + 1] @ whole
-
-
 SOURCE = "stitcher"
 """Name of the in-betweener in notes."""
 MAX_CONTEXT = 10
@@ -817,8 +680,8 @@ MAX_CONTEXT = 10
 _WIDENED = 1.25
 """By how much draws are wider than what training found, with which the best of eight is nearest to the truth: answers
 differ by as much more, and the best of eight is hardly farther from the truth."""
-_NOT_FINITE = "nothing finite came of it"
-_FARTHEST = 0.3  # metres of unit size from a trajectory over which steps can be moved without breaking
+_CHUNK, _LARGEST_SEED = 16, 2**63
+"""Draws whose noise comes from one seed, and a bound of seeds."""
 _PARTNERS = CANONICAL.mirror_partners()
 
 
@@ -832,35 +695,16 @@ class Stitcher(checkpoints.NetworkModel[StitcherNetwork], Inbetweener):
     """Seed of its draws; without one the answer is the mean one, with the latent at its mean."""
     number: int = 0
     """Number of the draw that it proposes."""
-    chunks: dict[tuple[bytes, int, int], Joined] = field(default_factory=dict)
-    """Draws so far, by the ends, the frames from one to the other and the number of the chunk."""
 
     @property
     def longest(self) -> int:
         """Frames of the longest gap that it fills."""
         return self.network.config.longest - 1
 
-    def drawing(self, seed: int = 0) -> "Stitcher":
-        """Return the in-betweener that proposes the first draw with a seed, and by `numbered` the others. The noise is
-        a quarter wider than that of the weights."""
-        return replace(self, seed=seed, number=0, chunks={})
-
-    def numbered(self, number: int) -> "Stitcher":
-        """Return the in-betweener that proposes the draw of a `number`, an index from 0 on."""
-        return replace(self, number=number)
-
-    @property
-    def _temperature(self) -> float:
-        """Standard deviation of the noise of draws."""
-        return _WIDENED * float(self.network.temperature)
-
-    def _draw_latents(self, seed: int, start: int, frames: int, chunk: int) -> DrawnLatents:
-        """Draw a chunk's latents, for the ends of a gap that starts at a frame."""
-        noise = torch.Generator().manual_seed((seed + 1_000_003 * start + 7_919 * chunk) % _LARGEST_SEED)
-        return DrawnLatents.sample(self.network.config, CHUNK, frames, noise).scale(self._temperature)
-
-    def _walk(self, ends: Ends, frames: int, latents: DrawnLatents) -> Joined:
-        return join_sides(walk_sides(self.network, ends.repeat(len(latents.shared)), frames, latents))
+    def drawing(self, seed: int = 0, number: int = 0) -> "Stitcher":
+        """Return the in-betweener that proposes the draw of a number, from 0 on, with a seed. The noise is a quarter
+        wider than that of the weights."""
+        return replace(self, seed=seed, number=number)
 
     @torch.no_grad()
     def answer(self, ends: Ends, frames: int) -> Joined:
@@ -871,17 +715,13 @@ class Stitcher(checkpoints.NetworkModel[StitcherNetwork], Inbetweener):
         return _average_mirrored(joined, batch)
 
     @torch.no_grad()
-    def draw(self, ends: Ends, start: int, frames: int, number: int) -> Joined | None:
-        """Return the draw of a number for the ends of a gap that starts at a frame, generated with the chunk that it is
-        in if it is not there; the next finite one where it is not finite, and None where the whole chunk is not."""
-        assert self.seed is not None
-        chunk, row = divmod(number, CHUNK)
-        given = b"".join(part.numpy().tobytes() for part in vars(ends).values())
-        if (generated := self.chunks.get((given, frames, chunk))) is None:
-            generated = self._walk(ends, frames, self._draw_latents(self.seed, start, frames, chunk))
-            self.chunks[given, frames, chunk] = generated
-        good = generated.finite.roll(-row).nonzero()
-        return generated.row((row + int(good[0])) % CHUNK) if len(good) else None
+    def draw(self, ends: Ends, start: int, frames: int, seed: int) -> Joined:
+        """Return the draw of this number with a seed, for the ends of a gap that starts at a frame."""
+        chunk, row = divmod(self.number, _CHUNK)
+        generator = torch.Generator().manual_seed((seed + 1_000_003 * start + 7_919 * chunk) % _LARGEST_SEED)
+        drawn = DrawnLatents.sample(self.network.config, _CHUNK, frames, generator).rows(torch.tensor([row]))
+        latents = drawn.scale(_WIDENED * float(self.network.temperature))
+        return join_sides(walk_sides(self.network, ends, frames, latents))
 
     @torch.no_grad()
     def connect(
@@ -920,60 +760,28 @@ class Stitcher(checkpoints.NetworkModel[StitcherNetwork], Inbetweener):
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
         """Propose motion for gaps between whole poses of up to `longest` frames; all else stays interpolated, and the
         proposal notes it. Frames beside a gap that are wholly known, up to MAX_CONTEXT of them, are looked at. Draws
-        have a seed of their own. Constraints within a gap on hands, feet, hips or their trajectory lead the answer
-        (see `priors.stitcher`) and is met about as well as the motion of the data allows."""
+        have a seed of their own; partial keys are not seen."""
+        query = query.hide_partial_keys()
         body = query.to_unit_size(query.motion)
         toes = body.joint_positions()[:, list(TOE_JOINTS)]
         root, quats = body.root_position.clone(), body.local_quat_xyzw.clone()
         logits = contacts.to_logits(contacts.detect_contacts(toes, PRIOR_FPS)).float()
-        sources = []
-        whole = query.hide_partial_keys()
-        for start, stop in whole.enclosed_gaps:
-            reason, remark, found = self._refuse(whole, start, stop), "", None
-            if not reason:
-                ends, constraints = (
-                    see_ends(body, whole.missing.frames, start, stop),
-                    Constraints.of(query, start, stop),
-                )
-                found = self._find(ends, start, stop - start + 1, constraints)
-                if found is not None and constraints is not None:
-                    off = constraints.measure_farthest(found)
-                    remark = f"led by the constraints in it, of which it is {100 * query.scale * off:.1f} cm off unbent"
-                    if query.keep_trajectory and off > _FARTHEST:
-                        reason = f"with steps that stay {query.scale * off:.2f} m off the trajectory"
-                    found = None if reason else constraints.lay_along(found)
-            parts = [gap for gap in query.enclosed_gaps if start <= gap[0] and gap[1] <= stop] or [(start, stop)]
-            if found is None:
-                sources += [GapSource(*gap, INTERPOLATION, reason or _NOT_FINITE) for gap in parts]
+        sources = _list_partly_known(query)
+        for start, stop in query.enclosed_gaps:
+            if reason := self._refuse(query, start, stop):
+                sources.append(GapSource(start, stop, INTERPOLATION, reason))
+                continue
+            ends, frames = see_ends(body, query.missing.frames, start, stop), stop - start + 1
+            found = self.answer(ends, frames) if self.seed is None else self.draw(ends, start, frames, self.seed)
+            if not found.finite:
+                sources.append(GapSource(start, stop, INTERPOLATION, "nothing finite came of it"))
                 continue
             part = slice(start, stop)
             root[part], quats[part] = _place(found, body, start)
             logits[part] = found.contacts[0]
-            apart = query.scale * float(found.apart[0])
-            sources += [GapSource(*gap, SOURCE, apart=apart, remark=remark) for gap in parts]
-        sources += _list_partly_known(whole)
+            sources.append(GapSource(start, stop, SOURCE, apart=query.scale * float(found.apart[0])))
         moved = replace(body, root_position=root, local_quat_xyzw=rotations.make_sign_continuous(quats))
         return Proposal(query.to_character(moved), logits, SOURCE, tuple(sources))
-
-    def _find(self, ends: Ends, start: int, frames: int, constraints: Constraints | None) -> Joined | None:
-        """Find the answer to the ends of a gap: the calm one or the draw of this number, or the one near it that meets
-        constraints; None where it is not finite."""
-        config = self.network.config
-        if constraints is None:
-            if self.seed is not None:
-                return self.draw(ends, start, frames, self.number)
-            found = self.answer(ends, frames)
-        else:
-            latents = DrawnLatents.calm(config, 1, frames)
-            if self.seed is not None:
-                chunk, row = divmod(self.number, CHUNK)
-                latents = self._draw_latents(self.seed, start, frames, chunk).rows(torch.tensor([row]))
-
-            def make(shared: Float[Tensor, "batch shared"]) -> Joined:
-                return self._walk(ends, frames, DrawnLatents(shared, latents.slow.expand(-1, len(shared), -1, -1)))
-
-            found = fit_shared(make, constraints.measure, latents.shared[0], self._temperature)
-        return found if bool(found.finite.all()) else None
 
     def _refuse(self, query: GapQuery, start: int, stop: int) -> str:
         """Return why a gap is not stitched; empty where it is."""
@@ -982,7 +790,7 @@ class Stitcher(checkpoints.NetworkModel[StitcherNetwork], Inbetweener):
         edges = query.missing.joints[[start - 1, stop]].any() | query.missing.root[[start - 1, stop]].any()
         if bool(edges) or query.loose is not None:
             return f"known in part, where the {SOURCE} takes whole poses"
-        return ""
+        return "along a trajectory, which it does not take" if query.keep_trajectory else ""
 
 
 def see_ends(body: Motion, missing: Tensor, start: int, stop: int) -> Ends:

@@ -36,11 +36,6 @@ class RetracedInbetweener(Inbetweener):
     poses: Inbetweener | None = None
     """In-betweener for missing poses; none where none are missing."""
 
-    @property
-    def takes_partial_keys(self) -> bool:
-        """As the in-betweener for poses does."""
-        return self.poses is not None and self.poses.takes_partial_keys
-
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
         """Propose the poses' motion along the predicted trajectory, which leads from the last known position of the
         hips to the next. Gaps in which nothing at all is known keep the trajectory that was proposed with them."""

@@ -5,10 +5,8 @@
 - Rollouts of a density, steered to the next known frames (Wang et al. 2019, Eq. 14-19, with the frames after a gap as
   the target): a swarm searches latent noise of the root, then L-BFGS all latent noise; the error left at arrival is
   distributed over the gap.
-- Proposals through partial keys, which give only positions of hands, feet or hips. An in-betweener that was not trained
-  with such keys meets them in their frame and ignores them in the frames beside, so they are hidden from it: it
-  proposes freely, then along the trajectory on which the targets can be met. The error left at a key's frame is met by
-  the smallest motion of the whole body (`mapctl.inbetweening.whole_body`).
+- Proposals through partial keys, which give only positions of hands, feet or hips. In-betweeners see those of the hips;
+  then the smallest motion of the whole body meets what is left (`mapctl.inbetweening.whole_body`).
 - The choice among them (`AutoInbetweener`). Rollouts have no part in it: their feet slide less as proposed, but the MAP
   stage plants the feet of either, and then the pose transformer's answer is nearer to mocap.
 """
@@ -52,9 +50,7 @@ from mapctl.solver.swarm import SwarmSettings
 from mapctl.terms import FootContact, Keyframe, LatentPrior
 
 _MIN_ROOT_UNCERTAINTY = 0.02  # metres, of the position of a standing body
-_ROOT_UNCERTAINTY_SHARE = 0.4  # of the distance travelled since the last known position
-_MIN_DIRECTION_SPEED = 0.2  # m/s from which a trajectory determines the facing
-_STEP_SECONDS = 0.25
+_ROOT_UNCERTAINTY_SHARE = 0.1  # of the distance travelled since the last known position
 _STRETCH_SHARE = 0.985  # of a limb's length that it reaches
 _MIN_LIMB_SECONDS, _LIMB_ACCELERATION = 0.15, 15.0
 """Least time in which a limb goes to its target, and its acceleration (m/s^2) beyond that: a sixth of what hands and
@@ -76,62 +72,21 @@ def propose_through_keys(
 ) -> tuple[Proposal, EffectorTargets | None]:
     """Propose a motion with hands and feet at their targets, and the hips at theirs in frames that give no more; also
     return the targets, moved within reach where they are not."""
-    hips, targets, wanted = _find_partial_keys(query)
-    if not bool((hips | wanted).any()):
-        return inbetweener.propose(query, generator=generator), targets
-    if inbetweener.takes_partial_keys:
-        answer = inbetweener.propose(query, generator=generator)
-        far = wanted if targets is None else wanted & _find_out_of_reach(answer.motion, targets)
-        if targets is None or not bool(far.any()):
-            return answer, targets
-        # The body moves where limbs alone do not reach, and no more than that: it would leave where the network has it.
-        near = EffectorTargets(targets.positions, targets.wanted & far[:, None])
-        answer, reached = _move_body(query, answer, answer.motion, near, far, query)
-        return answer, EffectorTargets(reached.positions, targets.wanted)
-    blind = guided = query.hide_partial_keys()
-    if bool(query.missing.root.any()):
-        first = inbetweener.rough.propose(blind, generator=generator).motion
-        guided = _interpolate_trajectory(query, blind, first, targets, hips)
-    answer = inbetweener.propose(replace(guided, effector_targets=_add_root_targets(query, hips)), generator=generator)
-    return meet_partial_keys(query, answer)
-
-
-def meet_partial_keys(query: GapQuery, answer: Proposal) -> tuple[Proposal, EffectorTargets | None]:
-    """Bend a motion that does not meet partial keys until it does, going there and coming back as bodies do; also
-    return the targets, moved within reach where they are not."""
-    hips, targets, wanted = _find_partial_keys(query)
-    if not bool((hips | wanted).any()):
-        return answer, targets
-    blind, posed = query.hide_partial_keys(), _set_hips(answer.motion, query.motion, hips)
-    if targets is None:
-        return replace(answer, motion=_blend_key_poses(answer.motion, posed, hips, blind)), None
-    return _move_body(query, answer, posed, targets, hips | wanted, blind)
-
-
-def _find_partial_keys(
-    query: GapQuery,
-) -> tuple[Bool[Tensor, " frames"], EffectorTargets | None, Bool[Tensor, " frames"]]:
-    """Find the frames in which the hips alone are given, the effector targets, and the frames that have some."""
     hips, targets = query.root_only_keys, query.effector_targets
-    return hips, targets, torch.zeros_like(hips) if targets is None else targets.wanted.any(dim=1)
-
-
-def _move_body(
-    query: GapQuery,
-    answer: Proposal,
-    posed: Motion,
-    targets: EffectorTargets,
-    keys: Bool[Tensor, " frames"],
-    blind: GapQuery,
-) -> tuple[Proposal, EffectorTargets]:
-    """Move the whole body of `posed` to the targets, and blend the answer to it in the frames of keys; also return the
-    targets as they are reached."""
-    stray = torch.full(keys.shape, _MIN_ROOT_UNCERTAINTY)
-    turning, moving = query.missing.joints, query.missing.root
-    posed = reach_targets(posed, targets, turning=turning, moving=moving, stray=stray)[0]
-    reached = torch.where(targets.wanted[..., None], posed.joint_positions(), targets.positions)
-    there = replace(answer, motion=_blend_key_poses(answer.motion, posed, keys, blind))
-    return there, EffectorTargets(reached, targets.wanted)
+    answer = inbetweener.propose(replace(query, effector_targets=None), generator=generator)
+    posed, keys = _set_hips(answer.motion, query.motion, hips), hips
+    if targets is not None:
+        # The body moves where limbs alone do not reach, and no more than that.
+        far = _find_out_of_reach(posed, targets)
+        beyond = EffectorTargets(targets.positions, targets.wanted & far[:, None])
+        turning, moving = query.missing.joints, query.missing.root
+        stray, keys = _estimate_root_uncertainty(answer.motion, moving), hips | far
+        posed = reach_targets(posed, beyond, turning=turning, moving=moving, stray=stray)
+        reached = torch.where(beyond.wanted[..., None], posed.joint_positions(), targets.positions)
+        targets = EffectorTargets(reached, targets.wanted)
+    if not bool(keys.any()):
+        return answer, targets
+    return replace(answer, motion=_blend_key_poses(answer.motion, posed, keys, query.hide_partial_keys())), targets
 
 
 def _find_out_of_reach(motion: Motion, targets: EffectorTargets) -> Bool[Tensor, " frames"]:
@@ -143,49 +98,6 @@ def _find_out_of_reach(motion: Motion, targets: EffectorTargets) -> Bool[Tensor,
     return far
 
 
-def _add_root_targets(query: GapQuery, hips: Bool[Tensor, " frames"]) -> EffectorTargets | None:
-    """Join the effector targets and the positions of hips that are known alone."""
-    targets = query.effector_targets
-    if not bool(hips.any()):
-        return targets
-    positions = query.motion.joint_positions()
-    wanted = torch.zeros(positions.shape[:2], dtype=torch.bool)
-    wanted[hips, 0] = True
-    if targets is None:
-        return EffectorTargets(positions, wanted)
-    positions = torch.where(targets.wanted[..., None], targets.positions, positions)
-    return EffectorTargets(positions, wanted | targets.wanted)
-
-
-def _interpolate_trajectory(
-    query: GapQuery, blind: GapQuery, body: Motion, targets: EffectorTargets | None, hips: Bool[Tensor, " frames"]
-) -> GapQuery:
-    """Return the query with its hips along a trajectory through all keys, and facing along it."""
-    root, facing = body.root_position.clone(), rotations.unwrap_angle(heading(body.local_quat_xyzw[:, 0]))
-    knots = ~blind.missing.root | hips
-    root[knots] = query.motion.root_position[knots]
-    own = heading(query.motion.local_quat_xyzw[:, 0])
-    facing = torch.where(knots, facing + rotations.wrap_angle(own - facing), facing)
-    if targets is not None:
-        wanted = targets.wanted.any(dim=1) & blind.missing.root & ~hips
-        turning, moving = blind.missing.joints, blind.missing.root
-        stray = _estimate_root_uncertainty(body, moving)
-        root = root + reach_targets(body, targets, turning=turning, moving=moving, stray=stray)[1]
-        positions = _interpolate_knots(root, knots | wanted, query.seconds)
-        facing = facing + torch.where(
-            knots, 0.0, _compute_heading_change(body.root_position, positions, float(body.fps))
-        )
-        knots = knots | wanted
-    positions = _interpolate_knots(root, knots, query.seconds)
-    turned = _interpolate_knots(facing[:, None], knots, query.seconds)[:, 0]
-    shown = query.motion
-    quats = shown.local_quat_xyzw.clone()
-    turn = torch.where(blind.missing.root, turned - heading(quats[:, 0]), 0.0)
-    quats[:, 0] = rotations.multiply(rotations.about_y(turn), quats[:, 0])
-    root = torch.where(blind.missing.root[:, None], positions, shown.root_position)
-    return replace(blind, motion=replace(shown, root_position=root, local_quat_xyzw=quats), keep_trajectory=True)
-
-
 def _estimate_root_uncertainty(body: Motion, missing: Bool[Tensor, " frames"]) -> Float[Tensor, " frames"]:
     """Estimate the uncertainty of proposed hips, metres: by their speed and the time from the nearest known frame."""
     known, frame, fps = ~missing[None], torch.arange(len(missing)), float(body.fps)
@@ -193,38 +105,6 @@ def _estimate_root_uncertainty(body: Motion, missing: Bool[Tensor, " frames"]) -
     seconds = torch.minimum((frame - before).abs(), (after - frame).abs()) / fps
     path_length = (body.root_position[after] - body.root_position[before])[:, ::2].norm(dim=-1)
     return _MIN_ROOT_UNCERTAINTY + _ROOT_UNCERTAINTY_SHARE * seconds * path_length * fps / (after - before).clamp_min(1)
-
-
-def _interpolate_knots(
-    values: Float[Tensor, "frames width"], knots: Bool[Tensor, " frames"], seconds: Float[Tensor, " frames"]
-) -> Float[Tensor, "frames width"]:
-    """Interpolate between values at knots by monotone cubics in time; constant beyond the first and the last."""
-    if int(knots.sum()) < 2:
-        return values
-    # Linear beyond the ends: a monotone cubic's own estimate of its slope there is up to half too large.
-    at, known = (torch.cat([2 * v[:1] - v[1:2], v, 2 * v[-1:] - v[-2:-1]]) for v in (seconds[knots], values[knots]))
-    curve = scipy.interpolate.PchipInterpolator(at.numpy(), known.numpy())
-    return torch.as_tensor(curve(seconds.clamp(at[1], at[-2]).numpy())).to(values)
-
-
-def _compute_heading_change(
-    before: Float[Tensor, "frames 3"], after: Float[Tensor, "frames 3"], fps: float
-) -> Float[Tensor, " frames"]:
-    """Compute the difference of two trajectories' directions, radians, weighted by speed: none where either stands."""
-    one, speed = _compute_travel_direction(before[:, ::2], fps)
-    other, other_speed = _compute_travel_direction(after[:, ::2], fps)
-    weight = torch.minimum(speed, other_speed).square()
-    return rotations.wrap_angle(other - one) * weight / (weight + _MIN_DIRECTION_SPEED**2)
-
-
-def _compute_travel_direction(
-    ground: Float[Tensor, "frames 2"], fps: float
-) -> tuple[Float[Tensor, " frames"], Float[Tensor, " frames"]]:
-    """Compute a trajectory's direction, radians, and speed, m/s, without the sway of single steps."""
-    reach, frame = max(1, round(_STEP_SECONDS * fps)), torch.arange(len(ground))
-    start, stop = (frame - reach).clamp_min(0), (frame + reach).clamp(max=len(ground) - 1)
-    velocity = (ground[stop] - ground[start]) * fps / (stop - start).clamp_min(1)[:, None]
-    return torch.atan2(velocity[:, 0], velocity[:, 1]), velocity.norm(dim=1)
 
 
 def _set_hips(body: Motion, known: Motion, frames: Bool[Tensor, " frames"]) -> Motion:
@@ -291,42 +171,23 @@ class StitchedInbetweener(Inbetweener):
     load_fallback: Callable[[], Inbetweener]
     """Loader of the in-betweener for the rest, called where there is some."""
 
-    @property
-    def takes_partial_keys(self) -> bool:
-        """Whether they reach `propose`: yes; they are hidden there from a fallback that does not take them."""
-        return True
-
     def propose(self, query: GapQuery, *, generator: torch.Generator | None = None) -> Proposal:
-        """Propose for each gap the stitcher's motion, bent to its partial keys; gaps that it leaves are the other's,
-        with the reason in the proposal."""
-
-        def propose_rest() -> Proposal:
-            fallback = self.load_fallback()
-            asked = query if fallback.takes_partial_keys else query.hide_partial_keys()
-            return fallback.propose(asked, generator=generator)
-
-        return _complete_stitched(query, self.stitcher.propose(query, generator=generator), propose_rest)
-
-
-def _complete_stitched(query: GapQuery, stitched: Proposal, propose_rest: Callable[[], Proposal]) -> Proposal:
-    """Bend a stitcher's proposal to partial keys, and take the gaps that it left interpolated from another one."""
-    sources = stitched.attribute(query)
-    left = [source for source in sources if source.by == INTERPOLATION]
-    filled = [source for source in sources if source.by != INTERPOLATION]
-    if filled:
-        stitched = meet_partial_keys(query, stitched)[0]
-    if not left:
-        return stitched
-    rest = propose_rest()
-    named = {source.start: source for source in rest.others}
-    for source in left:  # both reasons, where the other one left the gap, too
-        own = named.get(source.start, GapSource(source.start, source.stop, rest.source))
-        named[source.start] = replace(own, reason="; ".join(filter(None, (source.reason, own.reason))))
-    named |= {source.start: source for source in filled}
-    # Partial keys divide a gap, and are the stitcher's too.
-    whole = query.hide_partial_keys().enclosed_gaps
-    gaps = [gap for gap in whole if any(gap[0] <= source.start < gap[1] for source in filled)]
-    return replace(rest.take(stitched, gaps), others=tuple(named.values()))
+        """Propose for each gap the stitcher's motion; gaps that it leaves are the other's, with the reason in the
+        proposal."""
+        stitched = self.stitcher.propose(query, generator=generator)
+        sources = stitched.attribute(query.hide_partial_keys())
+        left = [source for source in sources if source.by == INTERPOLATION]
+        filled = [source for source in sources if source.by != INTERPOLATION]
+        if not left:
+            return stitched
+        rest = self.load_fallback().propose(query, generator=generator)
+        named = {source.start: source for source in rest.others}
+        for source in left:  # both reasons, where the other one left the gap, too
+            own = named.get(source.start, GapSource(source.start, source.stop, rest.source))
+            named[source.start] = replace(own, reason="; ".join(filter(None, (source.reason, own.reason))))
+        named |= {source.start: source for source in filled}
+        gaps = [(source.start, source.stop) for source in filled]
+        return replace(rest.take(stitched, gaps), others=tuple(named.values()))
 
 
 _LEAST_DISTANCE = 0.3  # metres from position to position, at the canonical size, that are walked and not stood
@@ -567,18 +428,13 @@ class RolloutInbetweener(Inbetweener):
         gap: tuple[int, int],
         generator: torch.Generator,
     ) -> tuple[Motion, Float[Tensor, "frames 2"]]:
-        """Roll through a gap to all joints in the known frames after it, and to effector targets within it; also
-        return the contact logits."""
+        """Roll through a gap to all joints in the known frames after it; also return the contact logits."""
         start, stop = gap
         part = slice(start, stop + self.ahead)
         known = ~query.nothing_known[part]
         frames = int(known.nonzero()[-1]) + 1
         positions = body.joint_positions()[part][:frames]
         wanted = known[:frames, None].expand(-1, CANONICAL.num_joints)
-        if (targets := query.effector_targets) is not None:
-            own = targets.wanted[part][:frames]
-            positions = torch.where(own[..., None], targets.positions[part][:frames] / query.scale, positions)
-            wanted = wanted | own
         arrival = Keyframe(positions.float(), wanted, _SIGMA_ARRIVAL)
         white = torch.randn(frames, LAYOUT.continuous, generator=generator)
         noise = _TEMPERATURE * gaussian.unit_variance_matrix(frames, _SLOW, white.dtype) @ white
@@ -635,7 +491,6 @@ _LIVELY = 0.5
 """Path of the joints seen from the hips, over that of the tweener, from which on a long gap without keys in it is the
 network's all the same: walks it fills better, and outside its training data it hardly moves."""
 _STYLED = 60  # frames of the shortest gap that is a tweener's that was given a style: in less there is no room for one
-_STITCHED = 60  # frames of the longest gap between whole poses, with partial keys in it, that is a stitcher's
 _HELD = 46  # frames of the shortest gap in which a pose is held
 _ASTRAY = 0.03  # metres over the ground from which on standing hips are astray, and the pose is held
 _SAME_POSE_DISTANCE = 0.06  # mean distance of the joints, metres, below which two poses count as one
@@ -644,8 +499,8 @@ _AT_REST = 0.15  # mean speed of the joints beside a gap, m/s, below which the b
 
 @dataclass(frozen=True, eq=False)
 class AutoInbetweener(Inbetweener):
-    """In-betweener that takes a network's proposal, except in gaps that are a tweener's or a stitcher's and where a
-    pose is held; the end is extrapolated by a density."""
+    """In-betweener that takes a network's proposal, except in gaps that are a tweener's and where a pose is held; the
+    end is extrapolated by a density."""
 
     network: Inbetweener
     """In-betweener that proposes first, and fills gaps in which something is known."""
@@ -655,19 +510,11 @@ class AutoInbetweener(Inbetweener):
     """Frames of the shortest gap between whole poses, with partial keys in it or none, that can be a tweener's."""
     tweener: Inbetweener | None = None
     """In-betweener for long gaps between whole poses; without one they are the network's."""
-    stitcher: Callable[[], Inbetweener] | None = None
-    """Loader of the stitcher, for short gaps between whole poses in which parts of the body are given; without one they
-    are the network's. It is called where there is such a gap."""
 
     @property
     def rough(self) -> Inbetweener:
         """Rough in-betweener of the network."""
         return self.network.rough
-
-    @property
-    def takes_partial_keys(self) -> bool:
-        """Whether the network does."""
-        return self.network.takes_partial_keys
 
     @property
     def has_style(self) -> bool:
@@ -686,19 +533,10 @@ class AutoInbetweener(Inbetweener):
         answer = self.network.propose(query, generator=generator)
         whole = query.hide_partial_keys().enclosed_gaps
         long = [gap for gap in whole if self._is_tweeners(query, *gap)]
-        stitched = [
-            gap
-            for gap in whole
-            if gap not in long and gap[1] - gap[0] <= _STITCHED and _has_parts_within(query, *gap)
-            if not (query.keep_trajectory or _is_beside_part(query, *gap))
-        ]
         if long and self.tweener is not None:
-            tweened, _ = propose_through_keys(query, self.tweener, generator)
+            tweened = self.tweener.propose(query, generator=generator)
             long = [gap for gap in long if self.has_style or not _stays_networks(query, answer, tweened, gap)]
             answer = _fill_from(tweened, answer, query, long)
-        if stitched and self.stitcher is not None:
-            network, short = answer, self.stitcher().propose(query, generator=generator)
-            answer = _fill_from(_complete_stitched(query, short, lambda: network), answer, query, stitched)
         for gap in query.enclosed_gaps:
             # A body that was given a style moves; tweeners let others tremble.
             held = not self.has_style if _is_within(gap, long) else _goes_astray(query, answer, gap)
@@ -723,7 +561,7 @@ class AutoInbetweener(Inbetweener):
 def _stays_networks(query: GapQuery, answer: Proposal, tweened: Proposal, gap: tuple[int, int]) -> bool:
     """Return whether a gap stays the network's: it fills the whole of it, and the body moves there."""
     by = {source.by for source in answer.attribute(query) if (source.start, source.stop) == gap}
-    if INTERPOLATION in by or _has_parts_within(query, *gap):
+    if INTERPOLATION in by:
         return False
     path, other = (measure_path_length(one.motion.slice(gap[0] - 1, gap[1] + 1)) for one in (answer, tweened))
     return path >= _LIVELY * other
@@ -733,12 +571,6 @@ def _is_beside_part(query: GapQuery, start: int, stop: int) -> bool:
     """Return whether a frame beside a gap is known in part."""
     edges = [start - 1, stop]
     return bool(query.missing.joints[edges].any() | query.missing.root[edges].any())
-
-
-def _has_parts_within(query: GapQuery, start: int, stop: int) -> bool:
-    """Return whether positions of hands, feet or hips are given within a gap."""
-    within, targets = slice(start, stop), query.effector_targets
-    return bool(query.root_only_keys[within].any() or (targets is not None and targets.wanted[within].any()))
 
 
 def _is_within(gap: tuple[int, int], gaps: Sequence[tuple[int, int]]) -> bool:
@@ -755,9 +587,7 @@ def _fill_from(proposal: Proposal, generated: Proposal, query: GapQuery, gaps: S
 
 def _is_standing_still(query: GapQuery, start: int, stop: int) -> bool:
     """Return whether the body rests in the same whole pose and position before and after a gap."""
-    targets = query.effector_targets
-    given = targets is not None and bool(targets.wanted[start:stop].any())
-    if stop - start < _HELD or query.keep_trajectory or given or _is_beside_part(query, start, stop):
+    if stop - start < _HELD or query.keep_trajectory or _is_beside_part(query, start, stop):
         return False
     positions, unknown = query.motion.joint_positions(), query.missing.frames
     apart = float((positions[stop] - positions[start - 1]).norm(dim=-1).mean())
@@ -799,9 +629,7 @@ class ModelLoaders:
 
 
 METHODS: Mapping[str, Callable[[ModelLoaders], Inbetweener]] = {
-    "auto": lambda models: AutoInbetweener(
-        models.network("auto"), models.densities(), tweener=models.tweener(), stitcher=models.stitcher
-    ),
+    "auto": lambda models: AutoInbetweener(models.network("auto"), models.densities(), tweener=models.tweener()),
     "transformer": lambda models: models.network("transformer"),
     "infiller": lambda models: models.network("infiller"),
     "tweener": lambda models: models.network("tweener"),

@@ -46,7 +46,8 @@ def shrink(
     for gap, several in tests.items():
         for hole, _ in several:
             hidden = views[gap].hide(hidden, hole)
-    trial = replace(query, motion=interpolate_missing(query.motion, hidden), missing=hidden)
+    motion = interpolate_missing(query.motion, hidden)
+    trial = replace(query, motion=motion, missing=hidden, effector_targets=None)
     tried = inbetweener.propose(trial, generator=generator) if any(tests.values()) else proposal
     simple = replace(proposal, motion=query.motion, contact_logits=estimate_contact_logits(query.motion))
     done, spread, remarks = proposal, proposal.spread.clone(), []

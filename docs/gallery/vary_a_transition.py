@@ -23,8 +23,7 @@ general, stitcher = priors.load("general"), priors.load_stitcher()
 start = next(k for k, clip in enumerate(general.initial_states.names) if "raise-up-left" in clip)
 settings, generator = GenerateSettings(start=start), torch.Generator().manual_seed(2)
 clip = controllers.generate(general, seconds=2.5, settings=settings, generator=generator).motion
-drawing = stitcher.drawing(seed=1)
-proposers = {"calm": stitcher, **{f"draw {number}": drawing.numbered(number) for number in range(1, 5)}}
+proposers = {"calm": stitcher, **{f"draw {number}": stitcher.drawing(1, number) for number in range(1, 5)}}
 variations = {name: controllers.infill(clip, each, [Mask("*", 22, 60)]).motion for name, each in proposers.items()}
 shots = [
     Shot(replace(each, root_position=each.root_position + torch.tensor([1.2 * position, 0.0, 0.0])))

@@ -232,10 +232,10 @@ def _choose_source(command: Tween, first: Inbetweener, dna: results.Examples) ->
     --dna names or of the classes that the tweener has; None for methods whose variations are rollouts. RequestError
     where there is nothing to draw from."""
     if isinstance(first, StitchedInbetweener) and isinstance(first.stitcher, Stitcher):
-        drawing, longest = first.stitcher.drawing(command.seed), first.stitcher.longest
+        stitcher = first.stitcher
         return Source(
-            lambda number, draws: replace(first, stitcher=drawing.numbered(number)),
-            f"whole poses with 1 to {longest} frames between them",
+            lambda number, draws: replace(first, stitcher=stitcher.drawing(command.seed, number)),
+            f"whole poses with 1 to {stitcher.longest} frames between them",
         )
     tweener = first.tweener if isinstance(first, AutoInbetweener) else first
     if not isinstance(tweener, Tweener) or (not dna and command.method != "tweener"):

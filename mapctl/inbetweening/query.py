@@ -142,8 +142,10 @@ class Proposal:
 
     def attribute(self, query: GapQuery) -> tuple[GapSource, ...]:
         """Name the source of each gap with known frames on both sides, and of the others' gaps, in temporal order."""
-        named = {start: GapSource(start, stop, self.source) for start, stop in query.enclosed_gaps}
-        named |= {other.start: other for other in self.others}
+        named = {other.start: other for other in self.others}
+        for start, stop in query.enclosed_gaps:
+            if not any(other.start <= start and stop <= other.stop for other in self.others):
+                named[start] = GapSource(start, stop, self.source)
         return tuple(named[start] for start in sorted(named))
 
 

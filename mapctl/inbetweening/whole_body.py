@@ -45,18 +45,17 @@ def reach_targets(
     turning: Bool[Tensor, "frames joints"],
     moving: Bool[Tensor, " frames"],
     stray: Float[Tensor, " frames"],
-) -> tuple[Motion, Float[Tensor, "frames 3"]]:
+) -> Motion:
     """Solve for a canonical motion whose hands and feet reach their targets, in the frames that have one.
 
     `turning` are joints that may rotate and `moving` frames in which the hips may move; all else stays. `stray` is the
     standard deviation, metres, of a shift of the whole body, feet included, over the ground. Feet without a target keep
     their positions, but for that shift, and their orientations. Frames without a target stay to the bit; limbs point at
-    a target out of reach. Also returns the shift, metres; 0 in all other frames.
+    a target out of reach.
     """
     frames = targets.wanted.any(dim=1).nonzero()[:, 0]
-    shifts = torch.zeros_like(body.root_position)
     if not len(frames):
-        return body, shifts
+        return body
     part = body.pick(frames)
     goals, wanted = targets.positions[frames], targets.wanted[frames]
     # Sigmas of shift (x, z), lean (x, y, z) and the rotations of the trunk; 0 for what may not move.
@@ -71,8 +70,7 @@ def reach_targets(
     bent = bend_limbs(posed, part, ends, wanted, turning[frames])
     root, quats = body.root_position.clone(), body.local_quat_xyzw.clone()
     root[frames], quats[frames] = bent.root_position, bent.local_quat_xyzw
-    shifts[frames] = shift
-    return replace(body, root_position=root, local_quat_xyzw=quats), shifts
+    return replace(body, root_position=root, local_quat_xyzw=quats)
 
 
 def _minimise_offsets(

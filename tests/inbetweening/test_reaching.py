@@ -138,11 +138,10 @@ def beside(motion, frame, *, ahead=0.0, aside=0.0, up=0.0):
 def test_a_hand_gets_there_and_standing_feet_stay(where):
     motion = walk(5, cadence=0.0)
     position = beside(motion, 2, **where)
-    result, shift = reach(motion, at(motion, {(2, "leftHand"): position}))
+    result = reach(motion, at(motion, {(2, "leftHand"): position}))
     positions, before = result.joint_positions(), motion.joint_positions()
     assert (positions[2, HAND] - position).norm() < 0.005
     assert (positions[2, FEET] - before[2, FEET]).norm(dim=-1).max() < 0.02  # at most a heel comes up for what is high
-    assert shift.norm() < 1e-6
     others = [0, 1, 3, 4]
     assert torch.equal(result.local_quat_xyzw[others], motion.local_quat_xyzw[others])
 
@@ -150,10 +149,10 @@ def test_a_hand_gets_there_and_standing_feet_stay(where):
 def test_an_oncoming_walker_is_passed_further_off_rather_than_stretched():
     motion = walk(3, cadence=0.0)
     targets = at(motion, {(1, "leftHand"): beside(motion, 1, ahead=0.9)})
-    result, shift = reach(motion, targets, stray=0.5)
-    assert shift[1, 2] > 0.3
+    result = reach(motion, targets, stray=0.5)
     feet = (result.joint_positions() - motion.joint_positions())[1, FEET]
-    torch.testing.assert_close(feet, shift[1].expand_as(feet), atol=1e-3, rtol=0)
+    assert float(feet[0, 2]) > 0.3
+    torch.testing.assert_close(feet, feet[:1].expand_as(feet), atol=1e-3, rtol=0)
 
 
 def test_what_may_not_move_does_not_and_bones_keep_their_lengths():
@@ -161,7 +160,7 @@ def test_what_may_not_move_does_not_and_bones_keep_their_lengths():
     targets = at(motion, {(2, "leftHand"): beside(motion, 2, ahead=0.6)})
     turning = torch.zeros(5, JOINTS, dtype=torch.bool)
     turning[:, [SHOULDER, CANONICAL.index("leftLowerArm")]] = True
-    result, _ = reach(motion, targets, turning=turning, moving=torch.zeros(5, dtype=torch.bool))
+    result = reach(motion, targets, turning=turning, moving=torch.zeros(5, dtype=torch.bool))
     kept = ~turning[0]
     assert torch.equal(result.local_quat_xyzw[:, kept], motion.local_quat_xyzw[:, kept])
     assert torch.equal(result.root_position, motion.root_position)

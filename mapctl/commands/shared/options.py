@@ -83,11 +83,10 @@ class ProposalOptions:
     """Options on how in-betweens are proposed."""
 
     method: Annotated[str, arg(metavar="auto|transformer|infiller|tweener|stitcher|rollouts|slerp")] = "auto"
-    """Method that proposes. auto: the transformer, the stitcher where hands, feet or hips are given in up to 2 s, the
-    tweener, if the set of weights has one, through gaps of more than 8 s and those of more than 6 s in which the
-    transformer hardly moves, or a held pose where the body stands still; a note on each gap names it. transformer,
-    infiller, tweener: that network alone. stitcher: gaps of up to 2 s between whole poses from both sides, led by
-    hands, feet, hips or a trajectory given in them. rollouts: a density's rollouts, wherever nothing is known. slerp:
+    """Method that proposes. auto: the transformer, the tweener, if the set of weights has one, through gaps of more
+    than 8 s and those of more than 6 s in which the transformer hardly moves, or a held pose where the body stands
+    still; a note on each gap names it. transformer, infiller, tweener: that network alone. stitcher: gaps of up to 2 s
+    between whole poses from both sides. rollouts: a density's rollouts, wherever nothing is known. slerp:
     interpolation."""
     dna: Annotated[str | None, arg(metavar="CLIP|NAME,...")] = None
     """Motion files of any known rig, or classes that `mapctl info tweener` lists, whose style the tweener takes: in all
@@ -98,8 +97,8 @@ class ProposalOptions:
     """The file or run folder of a trained transformer, infiller or tweener; the bundled one if not given. With auto a
     tweener is for long gaps, beside the bundled transformer."""
     stitcher: MaybeName = None
-    """The file or run folder of a trained stitcher for --method stitcher, where --inbetweener fills what it leaves, and
-    for auto; the bundled one if not given."""
+    """The file or run folder of a trained stitcher for --method stitcher, where --inbetweener fills what it leaves; the
+    bundled one if not given."""
     path: MaybeName = None
     """The file or run folder of a trained path predictor, for the tweener trained with it and for `infill --way`; the
     bundled one if not given."""

@@ -83,7 +83,7 @@ def check_proposal(command: options.ProposalOptions, *, prior: str | None = None
     whether --way asks for the hips' positions, of a command that has it."""
     method = command.method
     proposers.check_method(method)
-    if command.stitcher is not None and method not in ("auto", "stitcher"):
+    if command.stitcher is not None and method != "stitcher":
         raise RequestError(f"--method {method} stitches nothing; leave --stitcher out or take --method stitcher")
     if prior is not None and command.no_refine and method not in ("auto", "rollouts"):
         raise RequestError(f"--method {method} --no-refine has no MAP stage for a density; leave --prior out")
