@@ -4,33 +4,26 @@ The logarithm of the seconds is linear in what two poses show (see mapctl.inbetw
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from mapctl.errors import RequestError
 from mapctl.inbetweening.pose_pairs import MAX_FITTED_DISTANCE, PAIR_FEATURES, TRAVELLING_DISTANCE
 from priors import checkpoints
 from priors.checkpoints import NetworkConfig
 
+SHORTEST, LONGEST = 0.25, 4.0
+"""Seconds that are suggested at least, and at most where a pair is no farther apart than the fit's; poses of these are
+as far apart in time."""
+
 
 @dataclass(frozen=True)
 class KeyframeTimingConfig(NetworkConfig):
-    """Shape of the regression."""
+    """Shape of the regression, which leaves no choice."""
 
-    features: tuple[str, ...] = PAIR_FEATURES
-    """Features of a pair of poses."""
-    shortest: float = 0.25
-    """Seconds that are said at least, and that the pairs of the fit are apart."""
-    longest: float = 4.0
-    """Seconds that are said at most, where a pair is no farther apart than the fit's."""
-
-    def __post_init__(self):
-        if self.features != PAIR_FEATURES:
-            raise RequestError(f"a keyframe timing looks at {', '.join(PAIR_FEATURES)}, got {', '.join(self.features)}")
-        if not 0 < self.shortest < self.longest:
-            raise RequestError(f"shortest must lie between 0 and longest, got {self.shortest:g} and {self.longest:g}")
+    FIXED: ClassVar = {"features": list(PAIR_FEATURES), "shortest": SHORTEST, "longest": LONGEST}
 
 
 class KeyframeTimingNetwork(nn.Module):
@@ -43,7 +36,7 @@ class KeyframeTimingNetwork(nn.Module):
         """Unfitted, it predicts one second for every pair."""
         super().__init__()
         self.config = config
-        self.register_buffer("weights", torch.zeros(len(config.features)))
+        self.register_buffer("weights", torch.zeros(len(PAIR_FEATURES)))
         # 10th and 90th percentile of true over suggested seconds, of pairs about in place and of pairs that travel.
         self.register_buffer("ratios", torch.ones(2, 2))
 
@@ -51,7 +44,7 @@ class KeyframeTimingNetwork(nn.Module):
         self, features: Float[Tensor, "pairs features"], metres: Float[Tensor, " pairs"]
     ) -> Float[Tensor, "pairs 3"]:
         """Seconds that four of five pairs take at least, that are suggested, and that they take at most."""
-        seconds = torch.exp(features @ self.weights.to(features)).clamp(self.config.shortest, self.config.longest)
+        seconds = torch.exp(features @ self.weights.to(features)).clamp(SHORTEST, LONGEST)
         seconds = seconds * (metres / MAX_FITTED_DISTANCE).clamp_min(1)
         low, high = self.ratios.to(features)[(metres >= TRAVELLING_DISTANCE).long()].unbind(dim=-1)
         return torch.stack([low * seconds, seconds, high * seconds], dim=-1)

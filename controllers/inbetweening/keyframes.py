@@ -25,7 +25,6 @@ from mapctl.inbetweening.effector_targets import EffectorTargets, LooseKeys, est
 from mapctl.inbetweening.missing import interpolate_missing
 from mapctl.inbetweening.pose_pairs import (
     TRAVELLING_DISTANCE,
-    TimingModel,
     compute_pair_features,
     compute_pose_distance,
     compute_travel_distance,
@@ -393,9 +392,15 @@ class KeyInterval:
         return asdict(self) | {"given": self.given, "reason": self.reason}
 
 
-def suggest_intervals(motion: Motion, keys: Keys, timing: TimingModel, rig: Rig | None = None) -> list[KeyInterval]:
-    """Suggest the time between neighbouring keyframes that are whole poses; others may lie between. RequestError for
-    keys that do not fit the motion, and for fewer than two such poses."""
+def suggest_intervals(
+    motion: Motion,
+    keys: Keys,
+    timing: Callable[[Float[Tensor, "pairs features"], Float[Tensor, " pairs"]], Float[Tensor, "pairs 3"]],
+    rig: Rig | None = None,
+) -> list[KeyInterval]:
+    """Suggest the time between neighbouring keyframes that are whole poses; others may lie between. `timing` estimates
+    the 10th, 50th and 90th percentile of seconds by features of pairs and metres (see `priors.load_keyframe_timing`).
+    RequestError for keys that do not fit the motion, and for fewer than two such poses."""
     key_frames = [key.frame for key in keys.checked(motion) if key.what == "pose"]
     if len(key_frames) < 2:
         raise RequestError(f"timing is suggested between whole poses; the keys have {len(key_frames)}, it takes two")
@@ -404,7 +409,7 @@ def suggest_intervals(motion: Motion, keys: Keys, timing: TimingModel, rig: Rig 
     body = Motion(CANONICAL, canonical.fps, canonical.root_position / scale, canonical.local_quat_xyzw)
     first = torch.arange(len(key_frames) - 1)
     distances = compute_travel_distance(body, first, first + 1)
-    quantiles = (fps * timing.estimate_seconds(compute_pair_features(body, first, first + 1), distances)).tolist()
+    quantiles = (fps * timing(compute_pair_features(body, first, first + 1), distances)).tolist()
     metres = (scale * distances).tolist()
     pose_distances = (100 * scale * compute_pose_distance(body, first, first + 1)).tolist()
     intervals = []

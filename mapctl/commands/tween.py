@@ -106,7 +106,7 @@ def _run_request(command: Tween, request: KeyRequest | None) -> int:
     intervals = []
     if command.suggest_timing:
         timing = priors.load_keyframe_timing(command.timing or "keyframe-timing")
-        intervals = suggest_intervals(clip.motion, clip.keys, timing, clip.rig)
+        intervals = suggest_intervals(clip.motion, clip.keys, timing.estimate_seconds, clip.rig)
     generator = torch.Generator().manual_seed(command.seed)
     done = make(build_inbetweener(command.method, models), generator)
     more = {"keys": measure_keyframe_errors(done.motion, clip.motion, clip.keys, clip.rig)}

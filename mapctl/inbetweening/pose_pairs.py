@@ -3,7 +3,6 @@ cues of the gait (step length, bent knees and arms, a leaning trunk), which dist
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int
@@ -50,18 +49,6 @@ class PosePairs:
     """Distance of the hips over the ground, metres."""
     seconds: Float[Tensor, " pairs"]
     """Time between the poses, seconds."""
-
-
-@runtime_checkable
-class TimingModel(Protocol):
-    """Model of the time between two poses (see `priors.load_keyframe_timing`)."""
-
-    def estimate_seconds(
-        self, features: Float[Tensor, "pairs features"], metres: Float[Tensor, " pairs"]
-    ) -> Float[Tensor, "pairs 3"]:
-        """Estimate the 10th, 50th and 90th percentile of the time between the poses of pairs, seconds; `metres` is
-        their distance over the ground."""
-        ...
 
 
 def sample_pose_pairs(

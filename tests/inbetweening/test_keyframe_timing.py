@@ -15,7 +15,7 @@ KEYS = Keys((0, 20, 50, 89))
 
 
 def suggest_intervals(motion, keys):
-    return keyframes.suggest_intervals(motion, keys, priors.load_keyframe_timing())
+    return keyframes.suggest_intervals(motion, keys, priors.load_keyframe_timing().estimate_seconds)
 
 
 def frames(intervals):

@@ -9,7 +9,7 @@ from torch import Tensor
 from mapctl.features import GroundPose
 from mapctl.inbetweening.pose_pairs import TRAVELLING_DISTANCE, PosePairs, sample_pose_pairs
 from mapctl.pose import decode
-from priors.keyframe_timing import KeyframeTimingConfig, KeyframeTimingNetwork
+from priors.keyframe_timing import LONGEST, SHORTEST, KeyframeTimingConfig, KeyframeTimingNetwork
 from priors.training.data import Corpus, Split
 from priors.training.loop import Count, Export, Row, Settings, Trainer, geometric_mean
 
@@ -41,7 +41,7 @@ class KeyframeTimingTrainer(Trainer[KeyframeTimingNetwork]):
         super().__init__(settings)
         self.config = KeyframeTimingConfig()
         self.network = KeyframeTimingNetwork(self.config).double()
-        self.pairs = draw_pairs(corpus, self.config, self.generator)
+        self.pairs = draw_pairs(corpus, self.generator)
 
     def train_step(self) -> dict[str, float]:
         """Solve once, and see within which bounds the truth lies; the factor by which half of the pairs are off."""
@@ -57,7 +57,7 @@ class KeyframeTimingTrainer(Trainer[KeyframeTimingNetwork]):
 
     def validate(self, corpus: Corpus) -> Row:
         """The factor by which half of unseen pairs are off, and the share that lies within the bounds."""
-        pairs = draw_pairs(corpus, self.network.config, torch.Generator().manual_seed(0))
+        pairs = draw_pairs(corpus, torch.Generator().manual_seed(0))
         low, suggested, high = self.network(pairs.features, pairs.metres).unbind(dim=-1)
         ratio, inside = pairs.seconds / suggested, (pairs.seconds >= low) & (pairs.seconds <= high)
         row: Row = {"pairs": len(ratio), "half_off_by": _measure_error(ratio), "within": float(inside.double().mean())}
@@ -78,11 +78,11 @@ class KeyframeTimingTrainer(Trainer[KeyframeTimingNetwork]):
         return done
 
 
-def draw_pairs(corpus: Corpus, config: KeyframeTimingConfig, generator: torch.Generator) -> PosePairs:
+def draw_pairs(corpus: Corpus, generator: torch.Generator) -> PosePairs:
     """Draw pose pairs from every clip of a corpus; RequestError where no clip is long enough."""
     origin = GroundPose.origin(torch.float64)
     bodies = (decode(clip.double(), origin) for clip in corpus.clips())
-    return sample_pose_pairs(bodies, generator, count=_PAIRS, shortest=config.shortest, longest=config.longest)
+    return sample_pose_pairs(bodies, generator, count=_PAIRS, shortest=SHORTEST, longest=LONGEST)
 
 
 def solve_weights(pairs: PosePairs, before: Float[Tensor, " features"] | None) -> Float[Tensor, " features"]:
