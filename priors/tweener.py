@@ -17,6 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy.interpolate import CubicHermiteSpline
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
@@ -93,25 +94,14 @@ def bend_trajectory(
 def _walk_evenly(
     curve: Float[Tensor, "4 2"], count: int
 ) -> tuple[Float[Tensor, "frames 2"], Float[Tensor, "frames 2"]]:
-    """Return the points between the ends of a Hermite curve, in so many even steps, and the slopes there."""
-    steps = torch.diff(_evaluate(curve, torch.linspace(0, 1, _SAMPLES).to(curve))[0], dim=0).norm(dim=-1)
-    walked = pad(steps.cumsum(dim=0), (1, 0))
-    wanted = walked[-1] * torch.arange(1, count).to(curve) / count
-    after = torch.searchsorted(walked, wanted).clamp(1, _SAMPLES - 1)
-    before, step = walked[after - 1], walked[after] - walked[after - 1]
-    return _evaluate(curve, (after - 1 + (wanted - before) / step.clamp_min(1e-9)) / (_SAMPLES - 1))
-
-
-def _evaluate(curve: Float[Tensor, "4 2"], parameter: Float[Tensor, " points"]) -> tuple[Tensor, Tensor]:
-    """Return points and slopes of a cubic curve from its ends and its tangents there."""
-    u = parameter[:, None]
-    position = (2 * u**3 - 3 * u**2 + 1, 3 * u**2 - 2 * u**3, u**3 - 2 * u**2 + u, u**3 - u**2)
-    slope = (6 * u**2 - 6 * u, 6 * u - 6 * u**2, 3 * u**2 - 4 * u + 1, 3 * u**2 - 2 * u)
-    one, other = (
-        sum((weight * each for weight, each in zip(weights, curve, strict=True)), torch.zeros_like(u))
-        for weights in (position, slope)
-    )
-    return one, other
+    """Return the points between the ends of a cubic curve, given these and the tangents there, in so many even steps,
+    and the slopes there."""
+    first, last, leaving, arriving = curve.double().numpy()
+    spline = CubicHermiteSpline((0, 1), (first, last), (leaving, arriving))
+    parameter = np.linspace(0, 1, _SAMPLES)
+    walked = np.r_[0.0, np.linalg.norm(np.diff(spline(parameter), axis=0), axis=1).cumsum()]
+    even = np.interp(walked[-1] * np.arange(1, count) / count, walked, parameter)
+    return torch.from_numpy(spline(even)).to(curve), torch.from_numpy(spline(even, 1)).to(curve)
 
 
 def _ramp(value: Tensor, none: float, whole: float) -> Tensor:
