@@ -19,7 +19,7 @@ from mapctl import contacts, kinematics, rotations
 from mapctl.errors import RequestError
 from mapctl.features import PRIOR_FPS
 from mapctl.inbetweening import GapQuery, Proposal
-from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts, PartialMotion, interpolate_partial_motion
+from mapctl.inbetweening.partial_motion import KnownParts, PartialMotion, interpolate_partial_motion
 from mapctl.inbetweening.query import INTERPOLATION, GapSource
 from mapctl.numerics.intervals import count_frames_to_observed, true_intervals
 from mapctl.numerics.smooth_offsets import blend_seams_in_positions, blend_seams_in_rotations
@@ -31,12 +31,12 @@ from priors.checkpoints import NetworkConfig, Size
 _JOINTS = CANONICAL.num_joints
 _ROTATION_ROWS = 6 * _JOINTS
 _FLAG_ROWS = _JOINTS + 4
-_TARGET_ROWS = 4 * len(EFFECTORS)
+_TARGET_ROWS = 16  # of offsets of hands and feet from targets in single frames: the bundled weights have rows for these
 _TIME_ROWS = 3 * 2 * 3
 _TRAVEL_ROWS = 4
 _ROWS = _ROTATION_ROWS + 6 * _JOINTS + 1 + _FLAG_ROWS + _TARGET_ROWS + 2 + _TIME_ROWS + _TRAVEL_ROWS
 _OUT_ROWS = _ROTATION_ROWS + 3 + 2
-_STEP_UNIT, _TURN_UNIT, _TARGET_UNIT, _BONE_UNIT, _HIPS_UNIT = 0.05, 0.05, 0.2, 0.03, 0.1  # metres, radians
+_STEP_UNIT, _TURN_UNIT, _BONE_UNIT, _HIPS_UNIT = 0.05, 0.05, 0.03, 0.1  # metres, radians
 _TRAVEL_UNIT = 2.0  # metres
 _NEAR_FRAMES, _FAR_FRAMES = 5.0, 120.0  # frames: scales of the time to a known frame
 QUANTILES = (0.5, 0.9)
@@ -114,7 +114,7 @@ class PoseTransformerNetwork(nn.Module):
     def forward(self, motion: PartialMotion) -> ProposedPoses:
         """Propose poses for an interpolated motion."""
         shown = rotations.to_matrix(motion.quats)
-        seen = motion.known.rotations.any(dim=-1) | motion.known.ground | motion.known.effectors.any(dim=-1)
+        seen = motion.known.rotations.any(dim=-1) | motion.known.ground
         seen = seen | ~seen.any(dim=1, keepdim=True)
         rough = self._propose(motion, shown, self, seen)
         # Rotations are shown from the interpolated heading.
@@ -163,8 +163,7 @@ class PoseTransformerNetwork(nn.Module):
         world = rotations.rotate_about_y(local, motion.heading[..., None]) + ground
         step = rotations.rotate_about_y(_difference(world), -motion.heading[..., None]) / _STEP_UNIT
         turn = _difference(motion.heading[..., None]) / _TURN_UNIT
-        aim = rotations.rotate_about_y(motion.targets - world[..., list(EFFECTORS), :], -motion.heading[..., None])
-        aim = torch.where(known.effectors[..., None], aim / _TARGET_UNIT, 0.0)
+        no_targets = local.new_zeros(*local.shape[:2], _TARGET_ROWS)
         positions = (local - self.mean_position) / self.std_position
         # Where the hips are and face, seen from the first frame.
         ground, facing = motion.root_position[..., ::2], motion.heading
@@ -172,13 +171,14 @@ class PoseTransformerNetwork(nn.Module):
         turned = (facing - facing[:, :1])[..., None]
         return torch.cat(
             [
-                *(each.flatten(-2) for each in (six, positions, step, aim)),
+                *(each.flatten(-2) for each in (six, positions, step)),
+                no_targets[..., 4:],
                 turn,
                 2 * motion.contacts - 1,
                 known.rotations.float(),
                 torch.stack([known.heading, known.ground, known.height, known.path], dim=-1).float(),
-                known.effectors.float(),
-                *map(_encode_distance, (known.rotations.any(dim=-1), known.ground, known.effectors.any(dim=-1))),
+                no_targets[..., :4],
+                *map(_encode_distance, (known.rotations.any(dim=-1), known.ground, torch.zeros_like(known.ground))),
                 travelled,
                 torch.sin(turned),
                 torch.cos(turned),
@@ -354,7 +354,6 @@ class PoseTransformer(checkpoints.NetworkModel[PoseTransformerNetwork], Inbetwee
             ~missing.root[None],
             ~missing.root[None],
             (missing.root if query.keep_trajectory else nowhere)[None],
-            nowhere[None, :, None].expand(-1, -1, len(EFFECTORS)),
         )
         toes = body.joint_positions()[:, list(TOE_JOINTS)] / query.scale
         planted = torch.where(
@@ -365,7 +364,6 @@ class PoseTransformer(checkpoints.NetworkModel[PoseTransformerNetwork], Inbetwee
             rotations.unwrap_angle(heading).float()[None],
             quats.float()[None],
             planted[None],
-            torch.zeros(1, len(quats), len(EFFECTORS), 3),
             (body.skeleton.offsets / query.scale).float()[None],
             known,
         )

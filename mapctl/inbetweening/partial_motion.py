@@ -1,8 +1,7 @@
 """Partial motions: what is known of a motion by joint, by frame and by kind, and an interpolation of the rest.
 
 Known are rotations joint by joint; the position of the hips on the ground, their height and their heading, each for
-itself; a rough path of the hips; and positions of hands and feet in single frames. So lost joints, gaps, and keys that
-tell a part are one question to a network.
+itself; and a rough path of the hips. So lost joints, gaps, and keys that tell a part are one question to a network.
 """
 
 from dataclasses import dataclass, replace
@@ -12,17 +11,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mapctl import kinematics, rotations
-from mapctl.kinematics import inverse
-from mapctl.numerics import easing
 from mapctl.numerics.intervals import fill_missing, fill_missing_angle, last_observed, next_observed
-from mapctl.skeleton import CANONICAL, LIMBS, mirror_name
+from mapctl.skeleton import CANONICAL
 
-EFFECTORS = tuple(limb.end for limb in LIMBS.values())
-"""Canonical joints that may have a target: hands and feet."""
-_REACH_FRAMES = 15  # frames before and after a target over which a limb goes there and back
-_NEGLIGIBLE = 1e-5  # metres
 _PARTNERS = CANONICAL.mirror_partners()
-_EFFECTOR_PARTNERS = [EFFECTORS.index(CANONICAL.index(mirror_name(CANONICAL.names[joint]))) for joint in EFFECTORS]
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,15 +31,13 @@ class KnownParts:
     """Height of the hips."""
     path: Bool[Tensor, "batch frames"]
     """Whether an unknown position on the ground is shown roughly: the hips sway about it."""
-    effectors: Bool[Tensor, "batch frames effectors"]
-    """Whether a joint of EFFECTORS has a target."""
 
     @staticmethod
     def whole(frames: Bool[Tensor, "batch frames"]) -> "KnownParts":
         """Whole poses in some frames, nothing in the others."""
         none = torch.zeros_like(frames)
         every = frames[..., None].expand(-1, -1, CANONICAL.num_joints)
-        return KnownParts(every, frames, frames, frames, none, none[..., None].expand(-1, -1, len(EFFECTORS)))
+        return KnownParts(every, frames, frames, frames, none)
 
     @property
     def root(self) -> Bool[Tensor, "batch frames"]:
@@ -77,9 +67,7 @@ class KnownParts:
 
     def mirrored(self) -> "KnownParts":
         """Exchange left and right."""
-        return replace(
-            self, rotations=self.rotations[..., _PARTNERS], effectors=self.effectors[..., _EFFECTOR_PARTNERS]
-        )
+        return replace(self, rotations=self.rotations[..., _PARTNERS])
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,8 +82,6 @@ class PartialMotion:
     """Local rotations, xyzw; the hips' is their tilt, what is left without their heading."""
     contacts: Float[Tensor, "batch frames 2"]
     """Left and right toe planted, 0 or 1; 0.5 where the toe is not known."""
-    targets: Float[Tensor, "batch frames effectors 3"]
-    """World positions that EFFECTORS are to reach, metres; anything finite where there is no target."""
     offsets: Float[Tensor, "batch joints 3"]
     """Bones: each joint in its parent's frame, metres, of a body whose legs are as long as the canonical ones."""
     known: KnownParts
@@ -113,7 +99,7 @@ class PartialMotion:
 
     def slice(self, start: int, stop: int) -> "PartialMotion":
         """Return frames start to stop."""
-        by_frame = ("root_position", "heading", "quats", "contacts", "targets")
+        by_frame = ("root_position", "heading", "quats", "contacts")
         known = KnownParts(**{name: values[:, start:stop] for name, values in vars(self.known).items()})
         return replace(self, known=known, **{name: getattr(self, name)[:, start:stop] for name in by_frame})
 
@@ -125,7 +111,6 @@ class PartialMotion:
             -self.heading,
             mirror_quats(self.quats),
             self.contacts.flip(-1),
-            self.targets[..., _EFFECTOR_PARTNERS, :] * flip.to(self.targets),
             self.offsets[..., _PARTNERS, :] * flip.to(self.offsets),
             self.known.mirrored(),
         )
@@ -143,8 +128,7 @@ def interpolate_partial_motion(
 ) -> PartialMotion:
     """Interpolate a motion where it is not known: rotations along the shortest arc from the last known frame to the
     next, positions and heading linearly; beyond the first and the last they are held. Unknown values may be anything
-    finite, but a rough path is followed. What is known in no frame is the mean pose's, over the origin, facing +Z.
-    Unknown limbs then bend to their targets, from what they do half a second earlier and later."""
+    finite, but a rough path is followed. What is known in no frame is the mean pose's, over the origin, facing +Z."""
     known, root = motion.known, motion.root_position
     shown = known.ground | known.path
     ground = _where_ever(shown, fill_missing(root[..., ::2], shown), 0.0)
@@ -152,51 +136,12 @@ def interpolate_partial_motion(
     heading = _where_ever(known.heading, fill_missing_angle(motion.heading, known.heading)[..., None], 0.0)
     quats = interpolate_quats(motion.quats, known.rotations)
     ever = known.rotations.any(dim=1, keepdim=True)[..., None]
-    return _reach_targets(
-        replace(
-            motion,
-            root_position=torch.cat([ground[..., :1], height, ground[..., 1:]], dim=-1),
-            heading=heading[..., 0],
-            quats=torch.where(ever, quats, mean_quats.to(quats)),
-        )
+    return replace(
+        motion,
+        root_position=torch.cat([ground[..., :1], height, ground[..., 1:]], dim=-1),
+        heading=heading[..., 0],
+        quats=torch.where(ever, quats, mean_quats.to(quats)),
     )
-
-
-def _reach_targets(motion: PartialMotion) -> PartialMotion:
-    """Bend limbs that are not known to their targets."""
-    known = motion.known
-    rows = known.effectors.flatten(1).any(dim=1)
-    if not bool(rows.any()):
-        return motion
-    positions, matrices = (each[rows] for each in motion.world_poses())
-    world, quats, offsets = rotations.from_matrix(matrices), motion.quats[rows].clone(), motion.offsets[rows, None]
-    for number, limb in enumerate(LIMBS.values()):
-        free = ~known.rotations[rows][..., [limb.upper, limb.lower]].any(dim=-1)
-        wanted = known.effectors[rows][..., number] & free
-        error = torch.where(wanted[..., None], motion.targets[rows][..., number, :] - positions[..., limb.end, :], 0.0)
-        spread = _fade_between(error, wanted | ~free)
-        moved = free & (spread.norm(dim=-1) > _NEGLIGIBLE)
-        aim = positions[..., limb.end, :] + spread - positions[..., limb.upper, :]
-        turn, bent = inverse.reach(limb, world[..., limb.upper, :], quats[..., limb.lower, :], aim, offsets)
-        above = world[..., CANONICAL.parents[limb.upper], :]
-        bends = torch.stack([rotations.multiply(rotations.inverse(above), turn), bent], dim=-2)
-        joints = [limb.upper, limb.lower]
-        quats[..., joints, :] = torch.where(moved[..., None, None], bends, quats[..., joints, :])
-    return replace(motion, quats=motion.quats.index_put((rows,), quats))
-
-
-def _fade_between(
-    values: Float[Tensor, "batch frames 3"], firm: Bool[Tensor, "batch frames"]
-) -> Float[Tensor, "batch frames 3"]:
-    """Ease from each firm frame's value to the next one's, by way of 0 if that is far."""
-    frame = torch.arange(firm.shape[1])
-    before, after = last_observed(firm), next_observed(firm)
-    gap = torch.where(after > before, after - before, _REACH_FRAMES).clamp(1, _REACH_FRAMES)
-    result = torch.zeros_like(values)
-    for nearest, counts in ((before, True), (after, after != before)):
-        share = counts * (1 - easing.smootherstep((frame - nearest).abs() / gap))
-        result += share[..., None] * torch.take_along_dim(values, nearest[..., None], dim=1)
-    return result
 
 
 def mirror_quats(quats: Float[Tensor, "*batch joints 4"]) -> Float[Tensor, "*batch joints 4"]:

@@ -18,7 +18,7 @@ from mapctl import rotations
 from mapctl.contacts import ContactSettings
 from mapctl.errors import RequestError
 from mapctl.features import LAYOUT, PRIOR_FPS, GroundPose, ground_speed, mirror_features
-from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts, PartialMotion, mirror_quats
+from mapctl.inbetweening.partial_motion import KnownParts, PartialMotion, mirror_quats
 from mapctl.pose import BodyPose
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.training.data import Corpus, find_window_starts, number_clip_folders
@@ -239,8 +239,7 @@ class PoseWindows:
         batch, frames = clip.shape
         offsets = CANONICAL.offsets.to(root).expand(batch, -1, -1)
         known = KnownParts.whole(torch.ones(batch, frames, dtype=torch.bool))
-        targets = torch.zeros(batch, frames, len(EFFECTORS), 3)
-        return PartialMotion(root, heading, quats, self.contacts[nearest], targets, offsets, known)
+        return PartialMotion(root, heading, quats, self.contacts[nearest], offsets, known)
 
     def mean_quats(self) -> Float[Tensor, "joints 4"]:
         """Mean rotation of each joint, of a motion and its mirror image."""
@@ -266,7 +265,7 @@ def choose_rows(chosen: Tensor, one: PartialMotion, other: PartialMotion) -> Par
         first = getattr(one, name)
         return torch.where(chosen.view(-1, *[1] * (first.ndim - 1)), first, getattr(other, name))
 
-    names = ("root_position", "heading", "quats", "contacts", "targets", "offsets")
+    names = ("root_position", "heading", "quats", "contacts", "offsets")
     return replace(other, **{name: pick(name) for name in names})
 
 
@@ -279,11 +278,6 @@ def _reshape_bodies(window: PartialMotion, generator: torch.Generator) -> Partia
         factors[:, CANONICAL.indices(joints), :axes] = factor[:, None, None]
     chosen = (torch.rand(batch, generator=generator) < 0.5)[:, None, None]
     return replace(window, offsets=torch.where(chosen, window.offsets * factors, window.offsets))
-
-
-def add_targets(motion: PartialMotion) -> PartialMotion:
-    """Aim hands and feet at where they are."""
-    return replace(motion, targets=motion.world_poses()[0][..., list(EFFECTORS), :])
 
 
 def measure_lengths(vectors: Float[Tensor, "*batch axes"], least: float = 1e-10) -> Float[Tensor, "*batch"]:

@@ -17,15 +17,9 @@ from controllers.inbetweening.pipeline import CanonicalClip, fill
 from mapctl import retarget, rotations
 from mapctl.errors import RequestError
 from mapctl.inbetweening.missing import interpolate_missing
-from mapctl.inbetweening.partial_motion import (
-    EFFECTORS,
-    KnownParts,
-    PartialMotion,
-    interpolate_partial_motion,
-    mirror_quats,
-)
+from mapctl.inbetweening.partial_motion import KnownParts, PartialMotion, interpolate_partial_motion, mirror_quats
 from mapctl.recording.masks import ALL, ROOT, Mask, MissingMask
-from mapctl.skeleton import CANONICAL, LIMBS
+from mapctl.skeleton import CANONICAL
 
 
 def lost_of(motion, *masks):
@@ -221,9 +215,8 @@ def partial_motion(known, seed=0):
     quats = torch.where(known.rotations[..., None], quats, garbage)
     root = torch.where(known.root[..., None], motion.root_position[None], 9.0 + seed)
     heading = torch.where(known.heading, rotations.unwrap_angle(heading)[None], 50.0 * seed)
-    targets = torch.zeros(1, FRAMES, len(EFFECTORS), 3)
     offsets = CANONICAL.offsets[None]
-    return PartialMotion(root, heading, quats, torch.full((1, FRAMES, 2), 0.5), targets, offsets, known)
+    return PartialMotion(root, heading, quats, torch.full((1, FRAMES, 2), 0.5), offsets, known)
 
 
 def world_positions(motion):
@@ -242,25 +235,6 @@ def test_unknown_values_do_not_matter_and_known_ones_stay():
     known = partial_motion(gap()).known.positions
     truth = on_rig("canonical", FRAMES).joint_positions()[None]
     torch.testing.assert_close(world_positions(one)[known], truth[known], atol=1e-9, rtol=0)
-
-
-def test_unknown_limbs_bend_to_their_targets_and_known_ones_do_not():
-    given = torch.zeros(1, FRAMES, len(EFFECTORS), dtype=torch.bool)
-    hand, foot = EFFECTORS.index(CANONICAL.index("leftHand")), EFFECTORS.index(CANONICAL.index("rightFoot"))
-    given[0, 17, hand] = given[0, 5, foot] = True
-    motion = partial_motion(replace(gap(), effectors=given))
-    plain = interpolate_partial_motion(replace(motion, known=gap()), MEAN, 0.9)
-    positions, limb = world_positions(plain), LIMBS["leftHand"]
-    position = positions[0, 17, limb.upper] + torch.tensor([0.1, 0.2, 0.3])
-    motion.targets[0, 17, hand], motion.targets[0, 5, foot] = position, 5.0
-    result = world_positions(interpolate_partial_motion(motion, MEAN, 0.9))
-    torch.testing.assert_close(result[0, 17, limb.end].float(), position.float(), atol=2e-3, rtol=0)
-    off = (result - positions)[0, :, limb.end].norm(dim=-1)
-    assert 0 < float(off[11]) < float(off[14]) < float(off[17])
-    assert float(torch.diff(off).abs().max()) < 0.4 * float(off[17]), "there and back"
-    others = torch.ones(FRAMES, CANONICAL.num_joints, dtype=torch.bool)
-    others[10:25, [limb.lower, limb.end]] = False
-    torch.testing.assert_close(result[0][others], positions[0][others], atol=1e-9, rtol=0)
 
 
 def test_a_mirrored_motion_has_mirrored_places():

@@ -18,7 +18,7 @@ from mapctl.recording.masks import ALL, Mask, MissingMask
 from mapctl.retarget import to_canonical
 from priors import pose_transformer as module
 from priors.training.recipes.pose_transformer import hide
-from priors.training.windows import PoseWindows, add_targets
+from priors.training.windows import PoseWindows
 
 FRAMES = 50
 
@@ -92,7 +92,7 @@ def test_a_gap_longer_than_the_training_windows_is_left_and_reported():
 
 def windows(count=3, frames=30):
     drawn = PoseWindows(corpus(2, 80)).draw(count, frames, torch.Generator().manual_seed(0))
-    return add_targets(drawn)
+    return drawn
 
 
 def with_gap(motion, start, stop):

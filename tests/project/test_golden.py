@@ -16,6 +16,7 @@ LONG = {
     "tween file",
     "tween variations",
     "tween best",
+    "train infiller",
     "train lstm-gmm, paper",
 }
 """A quicker one of the same command is compared in any case; `python tests/golden.py` compares all."""

@@ -17,7 +17,7 @@ from trainable_models import small_settings
 from mapctl import kinematics, rotations
 from mapctl.features import LAYOUT, GroundPose, mirror_features
 from mapctl.inbetweening import Proposal
-from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts
+from mapctl.inbetweening.partial_motion import KnownParts
 from mapctl.inbetweening.pose_pairs import PosePairs
 from mapctl.inbetweening.root_trajectory import LocalMotion, RootTrajectory
 from mapctl.pose import decode
@@ -42,7 +42,7 @@ from priors.training.recipes.tweener import (
     draw_windows,
     group_clips,
 )
-from priors.training.windows import FeatureWindows, PoseWindows, add_targets
+from priors.training.windows import FeatureWindows, PoseWindows
 from priors.tweener import LABELS, ConstrainedPose, GeneratedPoses, GeneratorNetwork
 
 pytestmark = pytest.mark.usefixtures("small_judgements")
@@ -166,7 +166,7 @@ def test_an_infiller_is_compared_with_the_whole_motion():
     whole, holed = (compute_infiller_losses(network, motion, each) for each in (motion, with_gap(motion, 20, 30)))
     assert whole["error_cm"] == 0
     assert holed["error_cm"] > 1
-    torch.testing.assert_close(whole["position"], holed["position"])
+    assert float(holed["position"]) == pytest.approx(float(whole["position"]), rel=1e-2)
     assert whole["position"] > 1
 
 
@@ -195,7 +195,7 @@ def test_a_path_costs_what_its_steps_sum_up_to_over_every_span_and_its_height():
 
 
 def test_a_transformer_that_is_untrained_errs_as_interpolation_does_and_a_true_answer_costs_nothing():
-    truth = add_targets(PoseWindows(corpus(2, 60)).draw(4, 40, generator()))
+    truth = PoseWindows(corpus(2, 60)).draw(4, 40, generator())
     parts = compute_losses(tiny_transformer.network(), truth, truth)
     assert all(parts[name] < 1e-2 for name in ("positions_cm", "pace_cm", "turns"))
     hidden = with_gap(truth, 10, 25)
@@ -207,14 +207,11 @@ def test_a_transformer_that_is_untrained_errs_as_interpolation_does_and_a_true_a
 
 @pytest.mark.parametrize("frames", [8, 40])
 def test_parts_that_stay_known_are_the_motions_own(frames):
-    truth = add_targets(PoseWindows(corpus(2, 90)).draw(400, frames, generator()))
+    truth = PoseWindows(corpus(2, 90)).draw(400, frames, generator())
     shown = sample_known_parts(truth, generator(1))
     known = shown.known
     assert bool((known.rotations | known.root[..., None]).any(dim=2).any(dim=1).all())
     assert float((~known.everything).any(dim=1).float().mean()) > 0.97
-    assert not bool((known.effectors & known.positions[..., list(EFFECTORS)]).any())
-    positions = truth.world_poses()[0][..., list(EFFECTORS), :]
-    torch.testing.assert_close(shown.targets[known.effectors], positions[known.effectors], atol=1e-5, rtol=0)
     assert float((shown.root_position - truth.root_position).norm(dim=-1)[~known.path].max()) == 0
 
 

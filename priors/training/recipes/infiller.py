@@ -4,7 +4,7 @@ What is hidden is what is hidden from the pose transformer: beside the gaps and 
 section 3.3, keys far apart and poses known in part.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -77,11 +77,10 @@ def show_known(
     motion: PartialMotion, hidden: PartialMotion
 ) -> tuple[PositionImage, Float[Tensor, "batch frames joints 3"]]:
     """Return the image of a motion of which parts are hidden, interpolated there, and the true positions as it has
-    them. Positions of hands and feet that are given in single frames are no part of an image."""
-    known = replace(hidden.known, effectors=torch.zeros_like(hidden.known.effectors))
-    shown = interpolate_partial_motion(replace(hidden, known=known), hidden.quats.new_tensor(_REST), 0.0)
-    seen = known.positions
-    seen[..., 0] &= known.world_rotations[..., 0]
+    them."""
+    shown = interpolate_partial_motion(hidden, hidden.quats.new_tensor(_REST), 0.0)
+    seen = hidden.known.positions
+    seen[..., 0] &= hidden.known.world_rotations[..., 0]
     image = PositionImage.of_world(shown.world_poses()[0], shown.heading, motion.contacts, known=seen)
     return image, image.from_world(motion.world_poses()[0])
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
 from mapctl import rotations
-from mapctl.inbetweening.partial_motion import EFFECTORS, KnownParts, PartialMotion
+from mapctl.inbetweening.partial_motion import KnownParts, PartialMotion
 from mapctl.numerics import gaussian
 from mapctl.skeleton import CANONICAL, TOE_JOINTS
 from priors.pose_transformer import (
@@ -23,7 +23,7 @@ from priors.training.augment import Draws
 from priors.training.data import Corpus, Split
 from priors.training.gaps import InbetweenerTrainer
 from priors.training.loop import Count, Export, NetworkSettings, Number, make_adam, make_generator
-from priors.training.windows import TEMPO, PoseVariation, PoseWindows, add_targets, draw_length, measure_lengths
+from priors.training.windows import TEMPO, PoseVariation, PoseWindows, draw_length, measure_lengths
 
 _SHORTEST_WINDOW = 8  # frames
 _CALIBRATED_WINDOWS, _CALIBRATED_FRAMES = 128, (10, 20, 40, 60, 90)
@@ -49,7 +49,7 @@ _BARE = 0.4  # share of runs of known frames that are one frame long
 _CONTEXT = 16  # frames of the longest run beside a gap
 _OPEN = 0.08  # share of windows with gaps that end, or half as often begin, in one
 _GIVEN = 0.33  # share of windows with gaps of which something is known in the gap
-_REACHING = 0.5  # share of windows with lost joints whose lost hands or feet have known positions now and then
+_BOWED = 0.25  # share of windows with lost joints that also lack spine to head: a body that reaches far leans and turns
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +104,7 @@ class PoseTransformerTrainer(InbetweenerTrainer[PoseTransformerNetwork]):
     def losses(self) -> dict[str, Tensor]:
         frames = draw_length(_SHORTEST_WINDOW, self.longest, self.generator)
         batch = max(1, self.settings.batch // frames)
-        truth = add_targets(self.windows.draw(batch, frames, self.generator, variation=PoseVariation()))
+        truth = self.windows.draw(batch, frames, self.generator, variation=PoseVariation())
         return compute_losses(self.network, truth, sample_known_parts(truth, self.generator))
 
     @torch.no_grad()
@@ -125,7 +125,7 @@ def _measure_spread(network: PoseTransformerNetwork, corpus: Corpus, seed: int) 
     found: list[Tensor] = []
     for frames in _CALIBRATED_FRAMES:
         if frames * (1 + TEMPO) < int(windows.lengths.max()):
-            truth = add_targets(windows.draw(_CALIBRATED_WINDOWS, frames, generator, variation=PoseVariation()))
+            truth = windows.draw(_CALIBRATED_WINDOWS, frames, generator, variation=PoseVariation())
             shown = hide(network, sample_known_parts(truth, generator))
             proposed = network(shown)
             distance = (proposed.poses(truth.offsets)[0] - truth.world_poses()[0]).norm(dim=-1)
@@ -243,15 +243,11 @@ def sample_known_parts(motion: PartialMotion, generator: torch.Generator) -> Par
     poses = torch.where((lossy & (draw.uniform() < 0.8))[:, None], True, poses)
     known = KnownParts.whole(poses)
     lost = torch.where(lossy[:, None, None], _sample_lost_joints(draw), False)
-    reaching = lossy & (draw.uniform() < _REACHING)
-    # Spine to head in the frames that lack any joint: a body that reaches far leans and turns.
-    bowed = reaching & (draw.uniform() < 0.5)
+    bowed = lossy & (draw.uniform() < _BOWED)
     lost = lost | (bowed[:, None, None] & lost.any(dim=-1, keepdim=True) & _TRUNK)
     given = ~lossy & (draw.uniform() < _GIVEN)
     motion, known = _give_parts(draw, motion, known, given)
-    known = replace(known, rotations=known.rotations & ~lost)
-    effectors = reaching[:, None, None] & _sample_reached(draw, 0.5) & ~known.positions[..., list(EFFECTORS)]
-    return replace(motion, known=replace(known, effectors=known.effectors | effectors))
+    return replace(motion, known=replace(known, rotations=known.rotations & ~lost))
 
 
 def _sample_gaps(draw: Draws) -> Bool[Tensor, "batch frames"]:
@@ -294,17 +290,10 @@ def _sample_lost_joints(draw: Draws) -> Bool[Tensor, "batch frames joints"]:
     return torch.where((draw.uniform() < 0.15)[:, None, None], dropped, joints[:, None] & during[..., None])
 
 
-def _sample_reached(draw: Draws, held: float) -> Bool[Tensor, "batch frames 1"]:
-    """Draw frames in which hands and feet are given: one here and there, or, in a share of windows, a while."""
-    reached = draw.uniform(draw.frames, 1) < draw.uniform(1, 1) ** 2 * 0.12
-    stretch = draw.mark(draw.uniform() * draw.frames, 1 + draw.uniform() * 12)[..., None]
-    return torch.where((draw.uniform() < held)[:, None, None], stretch, reached)
-
-
 def _give_parts(
     draw: Draws, motion: PartialMotion, known: KnownParts, given: Bool[Tensor, " batch"]
 ) -> tuple[PartialMotion, KnownParts]:
-    """Make something known in gaps: some joints, the hips throughout, roughly, or at single frames, hands and feet."""
+    """Make something known in gaps: some joints, the hips throughout, roughly, or at single frames."""
     which = torch.where(given, draw.uniform(), 2.0)
 
     def chosen(low: float, high: float) -> Bool[Tensor, "batch 1"]:
@@ -322,14 +311,7 @@ def _give_parts(
     rotations[..., 0] |= hips & heading & (draw.uniform(1) < 0.6)
     ground, height = (each | (hips & (draw.uniform(1) < 0.85)) for each in (known.ground, known.height))
     path = chosen(0.35, 0.5) & ~ground
-    which_effectors = draw.uniform(1, len(EFFECTORS)) < 0.2 + 0.4 * draw.uniform(1, 1)
-    effectors = (
-        chosen(0.64, 1.01)[..., None]
-        & _sample_reached(draw, 0.2)
-        & which_effectors
-        & ~known.positions[..., list(EFFECTORS)]
-    )
-    parts = KnownParts(rotations, heading, ground, height, path, effectors)
+    parts = KnownParts(rotations, heading, ground, height, path)
     return replace(motion, root_position=_roughen(draw, motion.root_position, path)), parts
 
 
