@@ -7,7 +7,7 @@ from rig_maker import Make, make, names_of
 from scenes_walks import walk
 
 from mapctl.errors import RequestError
-from mapctl.joint_names import Part, Role, Side, classify_joint, find_joint
+from mapctl.joint_names import Part, Role, Side, classify_joint, describe_nearest, find_joint
 from mapctl.joint_roles import classify_joints, find_feet, find_hips, find_upper_legs
 from mapctl.retarget import canonical_joints, rigs
 from mapctl.skeleton import Skeleton
@@ -47,6 +47,12 @@ def test_own_names_as_written_come_first():
     assert find_joint("tail", names, lambda: known) is None
     with pytest.raises(RequestError, match="'HAND' may be Hand and hand; write it as the rig does"):
         find_joint("HAND", names)
+
+
+def test_the_nearest_names_are_on_the_same_side_and_limb_first():
+    names = ("lHand", "lThumb1", "rFoot", "rThumb1", "rHand")
+    assert describe_nearest("RightHnad", names) == "the nearest is rHand, then rThumb1 and rFoot"
+    assert describe_nearest("lefthand", names) == "the nearest is lHand, then lThumb1 and rHand"
 
 
 # hips, left and right upper leg, left and right toe; the order in a file varies and is no evidence.
