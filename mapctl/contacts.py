@@ -7,8 +7,8 @@ Detection on heels finds hardly more, so features hold the contacts of toes alon
 
 Local phases: how far each toe is in its own step, by when it is planted (Starke et al. 2020).
 
-Starke et al. fit a sinusoid to the filtered contacts of each bone around each frame. Here the same signal is made
-analytic: contacts are smoothed, standardised among the frames around, and turned into amplitude and phase by a Hilbert
+Starke et al. fit a sinusoid to the filtered contacts of each bone around each frame. Here their analytic signal is
+computed: contacts are smoothed, standardised among the frames around, and turned into amplitude and phase by a Hilbert
 transform. Their five bones are the two toes here, of which alone features hold contacts.
 """
 

@@ -161,7 +161,7 @@ class Footing:
                 " and the prior's data are of flat floors"
             )
         if self.over_edge:
-            found.append(f"{self.over_edge} feet stand over an edge: no foothold near enough has room for a sole")
+            found.append(f"soles that stand over an edge: {self.over_edge}; no foothold near enough has room for one")
         return tuple(found)
 
 

@@ -46,7 +46,7 @@ class Meter:
 
     @property
     def remaining(self) -> float:
-        """Evaluations that may still be made: a whole number, or infinity; none after the deadline."""
+        """Evaluations that are left: a whole number, or infinity; none after the deadline."""
         limit = math.inf if self.budget.evaluations is None else self.budget.evaluations
         return 0 if self._late() else max(0, limit - self.evaluations)
 
