@@ -64,7 +64,7 @@ class KeysOnGround:
         at_keys = (self.frames * PRIOR_FPS / float(motion.fps)).round().long().tolist()
         stepped = step_onto_ground(flat, self.ground, height, keys=at_keys)
         seconds = torch.arange(flat.num_frames, dtype=torch.float64) / PRIOR_FPS
-        met = _meet_keys(stepped, transfer_change(level, flat, stepped.motion, seconds), self.level, self.frames)
+        met = meet_keys(stepped, transfer_change(level, flat, stepped.motion, seconds), self.level, self.frames)
         sampled = replace(stepped, motion=met.resample(PRIOR_FPS))
         lifted = sampled.lift_swings(at_keys)
         met = transfer_change(met, sampled.motion, lifted.motion, seconds)
@@ -93,7 +93,7 @@ def _bring_to_floor(poses: Motion, ground: Ground, stance: Stance) -> Motion:
     return bend_legs(lower_by(poses, lower.mean(dim=1)), find_ankles(poses.skeleton, toes, feet), feet)
 
 
-def _meet_keys(stepped: SteppedMotion, motion: Motion, keyed: Motion, keys: Int[Tensor, " keys"]) -> Motion:
+def meet_keys(stepped: SteppedMotion, motion: Motion, keyed: Motion, keys: Int[Tensor, " keys"]) -> Motion:
     """Bring a canonical motion, as it was put onto ground, to the poses of another in the frames of keys. A foot that
     stands at a key is moved as much for as long as it stands, one that stands between keys stays."""
     at_keys, fps = torch.zeros(motion.num_frames, dtype=torch.bool), float(motion.fps)

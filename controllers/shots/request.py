@@ -25,7 +25,8 @@ from mapctl.kinematics.moving import bring_curve_points, measure_travel, move_to
 from mapctl.motion import Motion
 from mapctl.problem.receding_horizon import replay
 from mapctl.protocols import Density
-from mapctl.skeleton import LIMBS
+from mapctl.retarget.legs import lower_by
+from mapctl.skeleton import CANONICAL, LIMBS, TOES
 
 _MEMORY_FRAMES = 120  # at PRIOR_FPS, that warm up the density's state
 TRAVEL_FRAMES = 15
@@ -37,6 +38,7 @@ _STILL_SPEED = 0.3  # m/s of a joint, above which it gestures
 _PAST_FRAMES = 10  # of a clip, before a shot's first frame
 _SAME_POSITION = 0.05  # metres
 _LOWEST_HIPS, _MOST_RISE = 0.3, 0.4  # metres of a curve in space: of a child's hips, and from a crouch to a stand
+_LEVEL = 0.02  # metres by which the ground under both feet differs at most, to be level
 _APART_SECONDS = 2 / PRIOR_FPS  # between keys that are to differ
 
 
@@ -325,9 +327,8 @@ class ShotRequest:
             "a loop needs a closed curve, and this one is open": self.loop and not self.curve.closed,
             "a loop is walked once around, in its stride: without start, end, seconds, speeds by time": self.loop
             and (ends or self.seconds is not None or timed),
-            "on a ground a shot has a curve of x,z, and neither continues from a clip, ends in one, nor loops": (
-                self.ground is not None
-                and (self.lead is not None or self.arrival is not None or self.loop or self.curve.dims == 3)
+            "on a ground a shot has a curve of x,z and does not loop": (
+                self.ground is not None and (self.loop or self.curve.dims == 3)
             ),
         }
         if fault := next((what for what, holds in faults.items() if holds), None):
@@ -371,6 +372,29 @@ class ShotRequest:
         )
         looks = tuple(replace(key, position=lower(key.position, key.seconds)) for key in self.looks)
         return replace(self, reaches=reaches, looks=looks)
+
+    def lower_clips(self, ground: Ground, rest_height: float) -> "ShotRequest":
+        """Return the request with its clips over a flat floor, with toe joints at a height (metres) at rest: those that
+        stand on the ground are lowered by as much. RequestError where the shot would leave or meet one on ground that
+        is not level."""
+
+        def lower(motion: Motion, seam: int) -> Motion:
+            toes = motion.joint_positions()[seam, list(CANONICAL.indices(TOES))]
+            low, high = ground.height(toes[:, ::2]).aminmax()
+            if float(high - low) > _LEVEL:
+                raise RequestError(
+                    f"a clip's feet are over ground that differs by {100 * float(high - low):.0f} cm where the shot"
+                    " begins or ends in it; choose a frame over level ground"
+                )
+            over = toes[:, 1].amin() - rest_height
+            return lower_by(motion, torch.where((over - low).abs() < over.abs(), low, 0.0).expand(motion.num_frames))
+
+        lead, arrival = self.lead, self.arrival
+        return replace(
+            self,
+            lead=None if lead is None else Lead(lower(lead.motion, -1)),
+            arrival=None if arrival is None else Arrival(lower(arrival.motion, 0)),
+        )
 
     def _check_obstacles(self) -> None:
         """Raise RequestError for an obstacle in which the curve begins or a key lies."""

@@ -11,10 +11,11 @@ from dataclasses import dataclass, replace
 from functools import reduce
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from controllers.common.character import Character
+from controllers.inbetweening.on_ground import meet_keys
 from controllers.inbetweening.pipeline import fill
 from controllers.shots.constraints import Constraint, check_keys, check_walk, describe_conflicts
 from controllers.shots.footsteps import Footstep, find_footsteps
@@ -36,7 +37,7 @@ from controllers.shots.request import Reach, ShotRequest
 from controllers.shots.seams import OVERLAP, JoinedPieces, arrive, close_loop, fill_frames, go_on, join_pieces
 from controllers.shots.stairs import Stairs
 from controllers.shots.trajectory import Trajectory, plan_trajectory
-from controllers.shots.uneven import Footing, step_onto_ground
+from controllers.shots.uneven import Footing, SteppedMotion, step_onto_ground
 from controllers.shots.walk import FollowSettings, check_path, check_tracking, slows_in_corners, walk_spans
 from mapctl.curves import Curve
 from mapctl.errors import RequestError
@@ -47,7 +48,7 @@ from mapctl.problem.solution import Ledger, Solution, Status
 from mapctl.protocols import Density, Inbetweener
 from mapctl.retarget.legs import lower_by
 from mapctl.runtime.stepwise import Progress
-from mapctl.skeleton import CANONICAL, Skeleton
+from mapctl.skeleton import CANONICAL, TOES, Skeleton
 from mapctl.terms import Term
 
 
@@ -102,6 +103,8 @@ def solve_shot(
     began, settings = time.perf_counter(), settings or FollowSettings()
     character = Character(skeleton, settings.footing.rest_height)
     limits = character.data_limits(prior.limits)
+    if request.ground is not None:
+        request = request.lower_clips(request.ground, character.toe_rest_height)
     stairs, planned = Stairs.find(request.curve, request.ground), request
     if stairs.treads and not isinstance(request.speed, TimedSpeed):
         speed = stairs.slow(request.speed or walk_at_ease(request.curve), request.curve, limits.slowest)
@@ -140,9 +143,11 @@ def solve_shot(
         flat, met = meet_poses(flat, request.poses, trajectory, inbetweener)
     motion, posed = flat, pose_frames(met, flat.num_frames)
     if request.ground is not None:
-        fixed = [*posed.nonzero()[:, 0].tolist(), *(step.land for step in request.footsteps)]
+        clips = {0: request.lead, flat.num_frames - 1: request.arrival}
+        ends = [frame for frame, clip in clips.items() if clip is not None]
+        fixed = [*ends, *posed.nonzero()[:, 0].tolist(), *(step.land for step in request.footsteps)]
         stepped = step_onto_ground(flat, request.ground, character.toe_rest_height, keys=fixed)
-        motion = stepped.motion
+        motion = _meet_clips(stepped, torch.tensor(ends)) if ends else stepped.motion
     if inbetweener is not None:  # which knows motion over a floor alone
         rise = (motion.root_position - flat.root_position)[:, 1]
         level, settled = _meet_targets(lower_by(motion, rise), request.lower_targets(rise), posed, inbetweener)
@@ -197,6 +202,12 @@ def _finish_ends(
     if request.arrival is not None:
         motion = arrive(motion, request.arrival.bring_to(trajectory.curve, float(trajectory.arcs[-1])), inbetweener)
     return motion
+
+
+def _meet_clips(stepped: SteppedMotion, ends: Int[Tensor, " ends"]) -> Motion:
+    """Return a motion on ground, brought to its poses over level ground in the frames in which clips end and begin."""
+    rise = stepped.ground.height(stepped.flat.joint_positions()[:, CANONICAL.index(TOES[0]), ::2])
+    return meet_keys(stepped, stepped.motion, lower_by(stepped.flat, -rise), ends)
 
 
 def _meet_targets(

@@ -54,7 +54,7 @@ class RootVelocity:
         velocities, units, facing = self._tables
         known, weights = _build_velocity_smoother(self, trial.before, trial.fps, trial.features.dtype)
         known, weights, ground = known.double().numpy(), weights.double().numpy(), trial.root_xz_world.double().numpy()
-        start = trial.start.position_xz.double().expand(len(ground), 1, 2).numpy()
+        start = trial.start.position_xz.double().expand(len(ground), 2)[:, None].numpy()
         raw = float(trial.fps) * np.diff(ground, axis=1, prepend=start) - velocities
         error = np.einsum("fak,bfk->bfa", units, known + weights @ raw)
         pull = weights.T @ np.einsum("fak,bfa->bfk", units, error)
@@ -90,7 +90,7 @@ class RootVelocity:
     def _velocity_error(self, trial: Trial) -> Float[Tensor, "batch frames 2"]:
         known, weights = _build_velocity_smoother(self, trial.before, trial.fps, trial.features.dtype)
         ground = trial.root_xz_world
-        first = trial.start.position_xz.to(ground.dtype).expand(len(ground), 1, 2)
+        first = trial.start.position_xz.to(ground.dtype).expand(len(ground), 2)[:, None]
         error = torch.diff(ground, dim=1, prepend=first) * trial.fps - self.velocities.to(ground.dtype)
         return known + weights @ error
 

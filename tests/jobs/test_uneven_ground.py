@@ -12,7 +12,7 @@ from helpers import generator, run
 import controllers
 import priors
 from controllers.denoising.trajectory import correct_trajectory
-from controllers.shots.request import PoseKey, Reach, ShotRequest
+from controllers.shots.request import Arrival, Lead, PoseKey, Reach, ShotRequest
 from controllers.shots.shot import solve_shot
 from controllers.shots.stairs import Stairs
 from controllers.shots.trajectory import plan_trajectory
@@ -22,6 +22,7 @@ from mapctl.errors import RequestError
 from mapctl.ground import Ground
 from mapctl.intent.path import SpeedProfile
 from mapctl.metrics.feet import locate_heels
+from mapctl.retarget.legs import lower_by
 from mapctl.skeleton import CANONICAL, TOE_REST_HEIGHT, TOES
 from mapctl.terms import RootVelocity, StepLength
 from scenes import overlays
@@ -189,9 +190,54 @@ def test_poses_and_footsteps_are_met_on_the_ground(walked, path):
     assert done.footing.penetration < 0.01
 
 
-def test_clips_and_loops_on_a_ground_are_refused(path):
-    with pytest.raises(RequestError, match="nor loops"):
-        ShotRequest(curves.circle(radius=3), loop=True, ground=Ground.read(path))
+def find_level_frame(motion, ground, first):
+    """The first frame from one on with both toes over ground of one height."""
+    heights = ground.height(motion.joint_positions()[first:, list(CANONICAL.indices(TOES)), ::2].double())
+    return first + int((heights.diff(dim=1).abs()[:, 0] < 0.001).nonzero()[0])
+
+
+@pytest.mark.parametrize("floor", [False, True])
+def test_a_shot_continues_from_a_clip_and_ends_in_one_on_the_ground(walked, path, floor):
+    """On the ground, or over a floor of its own."""
+    ground, motion = Ground.read(path), walked.motion
+    at = find_level_frame(motion, ground, round(2.1 / 5 * motion.num_frames))
+    to = find_level_frame(motion, ground, motion.num_frames - 25)
+    lead, arrival = Lead.of(motion, at), Arrival.of(motion, to)
+    line = curves.line(length=float(motion.root_position[to, 2] - motion.root_position[at, 2]))
+    curve = lead.bring_curve(line)
+    if floor:
+        lead = Lead(lower_by(lead.motion, ground.height(lead.motion.root_position[-1:, ::2].double())))
+    request = ShotRequest(curve, lead=lead, arrival=arrival, ground=ground)
+    transformer = priors.load_inbetweener("transformer")
+    done = solve_shot(priors.load("locomotion"), transformer, request, generator=generator(0))
+    for frame, met in ((0, motion.slice(at, at + 1)), (-1, motion.slice(to, to + 1))):
+        off = done.motion.joint_positions()[frame] - met.joint_positions()[0]
+        assert float(off[:, 1].abs().max()) < 0.003
+        assert frame or float(off.norm(dim=-1).max()) < 0.003  # where it ends, the clip is moved to the path
+    assert done.footing is not None
+    assert done.footing.penetration < 0.01
+
+
+def test_loops_and_clips_over_edges_are_refused_on_a_ground(walked, path):
+    ground = Ground.read(path)
+    with pytest.raises(RequestError, match="does not loop"):
+        ShotRequest(curves.circle(radius=3), loop=True, ground=ground)
+    heights = ground.height(walked.motion.joint_positions()[:, list(CANONICAL.indices(TOES)), ::2].double())
+    lead = Lead.of(walked.motion, int(heights.diff(dim=1).abs()[:, 0].argmax()))
+    request = ShotRequest(lead.bring_curve(curves.line(length=1)), lead=lead, ground=ground)
+    with pytest.raises(RequestError, match="level ground"):
+        request.lower_clips(ground, TOE_REST_HEIGHT)
+
+
+def test_stairs_may_begin_with_the_walk(tmp_path):
+    """Its first window has a start for each candidate."""
+    stairs = tmp_path / "stairs.toml"
+    stairs.write_text("[[stairs]]\nstart = [0, 0.7]\nsteps = 3\nrise = 0.15\ntread = 0.3\n")
+    done = controllers.follow(
+        priors.load("locomotion"), curves.line(length=1.4), ground=Ground.read(stairs), generator=generator(0)
+    )
+    assert done.footing is not None
+    assert done.footing.penetration < 0.01
 
 
 def measure_depth(motion, ground):
