@@ -112,7 +112,7 @@ def _check_tree(rigmap: RigMap, poses: RigPoses) -> Iterator[Doubt]:
 def _find_second_body(poses: RigPoses, joints: Mapping[str, int]) -> int | None:
     """Find the hips of another body in the file than the one that is matched, by its tree; None where there is none.
 
-    A second set of joints in the same place, as the controls of a rig are, is no other body.
+    A second set of joints in the same position, as the controls of a rig are, is no other body.
     """
     skeleton = poses.skeleton
     near = descendants(skeleton, joints.values()) | ancestors(skeleton, joints.values())

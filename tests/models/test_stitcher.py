@@ -1,4 +1,4 @@
-"""The stitcher: both ends exact, draws, and who fills what cannot be stitched."""
+"""The stitcher: both ends exact, draws, and what fills gaps that cannot be stitched."""
 
 from dataclasses import replace
 
