@@ -5,7 +5,6 @@ back, the angles are unwrapped over time and the closer of the two equivalent so
 frame; those of a source can be kept in the frames that are still its own.
 """
 
-import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,6 +14,8 @@ from scipy.spatial.transform import Rotation
 from mapctl import rotations
 
 _W = 3  # index of the scalar in xyzw
+_GIMBAL = 1e-7
+"""Below this length of a pair of quaternion parts its angle is noise; holding it costs at most 2e-7 rad."""
 
 
 def to_quat_xyzw(radians: np.ndarray, axes: Sequence[int]) -> np.ndarray:
@@ -85,11 +86,26 @@ def _two_angles(quat: np.ndarray, axes: Sequence[int]) -> np.ndarray:
 
 
 def _three_angles(quat: np.ndarray, axes: Sequence[int]) -> np.ndarray:
-    """Solve three angles; in gimbal lock, of which scipy warns, the last is zero."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        angles = Rotation.from_quat(quat.reshape(-1, 4)).as_euler("".join("XYZ"[axis] for axis in axes))
-    angles = angles.reshape(*quat.shape[:-1], 3)
+    """Solve three angles: half sum and half difference of the outer ones are arguments of two pairs of quaternion
+    parts.
+
+    For distinct axes i, j, k these are (w + j, i + ek) and (w - j, i - ek), of lengths |cos b/2 +- sin b/2|; for ZXZ
+    and its like (w, i) and (j, ek), of lengths cos b/2 and sin b/2; e is the axes' handedness. Where a length is zero
+    (gimbal lock) only the other pair counts, and the lost angle keeps its last value.
+    """
+    i, j, last = axes
+    proper, k, sign = i == last, 3 - i - j, _handedness(i, j)
+    q_w, q_i, q_j, q_k = quat[..., _W], quat[..., i], quat[..., j], sign * quat[..., k]
+    real = (q_w, q_j) if proper else (q_w + q_j, q_w - q_j)
+    imaginary = (q_i, q_k) if proper else (q_i + q_k, q_i - q_k)
+    half_sum, sum_length = _hold_argument(imaginary[0], real[0])
+    half_difference, difference_length = _hold_argument(imaginary[1], real[1])
+    if proper:
+        middle, turn = 2 * np.arctan2(difference_length, sum_length), 1
+    else:
+        middle, turn = 2 * np.arctan2(sum_length - difference_length, sum_length + difference_length), sign
+    outer = half_sum + half_difference, turn * (half_sum - half_difference)
+    angles = np.stack([outer[0], middle, outer[1]], axis=-1)
     return _closest_path(angles, _equivalent_angles(angles, axes, half=np.pi))
 
 
@@ -97,6 +113,16 @@ def _equivalent_angles(angles: np.ndarray, axes: Sequence[int], *, half: float) 
     """Return the other three angles (..., 3) of the same rotations, in the unit in which a half turn is `half`."""
     first, middle, last = np.moveaxis(angles, -1, 0)
     return np.stack([first + half, (0 if axes[0] == axes[2] else half) - middle, last + half], axis=-1)
+
+
+def _hold_argument(imaginary: np.ndarray, real: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return argument and length of complex numbers over frames; where one vanishes its last argument holds."""
+    length = np.hypot(imaginary, real)
+    known = length > _GIMBAL
+    frame = np.arange(len(length)).reshape(-1, *[1] * (length.ndim - 1))
+    latest = np.maximum.accumulate(np.where(known, frame, 0), axis=0)
+    angle = np.where(known, np.arctan2(imaginary, real), 0.0)
+    return np.take_along_axis(angle, latest, axis=0), length
 
 
 def _closest_path(angles: np.ndarray, twin: np.ndarray) -> np.ndarray:
