@@ -143,7 +143,9 @@ def _raise_on_signals() -> list[int]:
     def stop(number: int, frame: FrameType | None) -> None:
         nonlocal until
         if _is_compiling(frame):  # LLVM calls Python back, drops what is raised there, and crashes
-            threading.Timer(0.05, signal.raise_signal, (number,)).start()
+            again = threading.Timer(0.05, _signal_main_thread, (number,))
+            again.daemon = True
+            again.start()
         elif time.monotonic() >= until:
             until = time.monotonic() + 1.0
             received.append(number)
@@ -154,6 +156,13 @@ def _raise_on_signals() -> list[int]:
         if number is not None and signal.getsignal(number) not in (signal.SIG_IGN, None):
             signal.signal(number, stop)
     return received
+
+
+def _signal_main_thread(number: int) -> None:
+    if hasattr(signal, "pthread_kill"):  # which ends a wait; Windows lacks it
+        signal.pthread_kill(threading.main_thread().ident or 0, number)
+    else:
+        signal.raise_signal(number)
 
 
 def _is_compiling(frame: FrameType | None) -> bool:

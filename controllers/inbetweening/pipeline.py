@@ -469,9 +469,9 @@ def _note_gaps(query: GapQuery, answer: Proposal, clip: CanonicalClip) -> tuple[
     for key, sources in sorted(noted.items(), key=lambda item: isinstance(item[0], str)):
         frames, words = [], [sources[0].by]
         for source in sources:
-            ends = [round(float(query.seconds[frame] * fps)) for frame in (source.start, source.stop - 1)]
-            first = max(edge for edge in edges if edge <= ends[0])
-            stop = min(edge for edge in edges if edge > ends[1])
+            inside = math.ceil(float(query.seconds[source.start]) * fps - _TIE_FRAMES)
+            last = max(inside, math.floor(float(query.seconds[source.stop - 1]) * fps + _TIE_FRAMES))
+            first, stop = max(edge for edge in edges if edge <= inside), min(edge for edge in edges if edge > last)
             frames.append(f"{first}:{stop}")
         if answer.spread is not None and sources[0].by == answer.source:
             errors = [100 * answer.spread[one.start : one.stop].mean(dim=(0, 1)) for one in sources]

@@ -181,12 +181,12 @@ class StitchedInbetweener(Inbetweener):
         if not left:
             return stitched
         rest = self.load_fallback().propose(query, generator=generator)
-        named = {source.start: source for source in rest.others}
+        gaps = [(source.start, source.stop) for source in filled]
+        named = {one.start: one for one in rest.others if not _is_within((one.start, one.stop), gaps)}
         for source in left:  # both reasons, where the other one left the gap, too
             own = named.get(source.start, GapSource(source.start, source.stop, rest.source))
             named[source.start] = replace(own, reason="; ".join(filter(None, (source.reason, own.reason))))
         named |= {source.start: source for source in filled}
-        gaps = [(source.start, source.stop) for source in filled]
         return replace(rest.take(stitched, gaps), others=tuple(named.values()))
 
 
@@ -194,11 +194,11 @@ _LEAST_DISTANCE = 0.3  # metres from position to position, at the canonical size
 
 
 def lay_curve(query: GapQuery, fastest: float, ahead: int) -> tuple[Curve, Float[Tensor, " ahead"]] | None:
-    """Lay a curve through the positions of a query of which they are all that is given, from its first frame to its
-    last, metres at the canonical size; also return the arcs of the frames and of so many `ahead` of them, metres. None
-    where there are others, and where the body would stand, or be faster than `fastest`, m/s."""
+    """Lay a curve through the positions of a query that gives no pose, from its first frame to its last, metres at the
+    canonical size; also return the arcs of the frames and of so many `ahead` of them, metres. None where there are
+    drawings or poses, and where the body would stand, or be faster than `fastest`, m/s."""
     loose = query.loose
-    if loose is None or bool(loose.drawn.any()) or query.effector_targets is not None:
+    if loose is None or bool(loose.drawn.any()):
         return None
     if not bool(query.nothing_known.all()):
         return None
@@ -488,8 +488,8 @@ STANDING_STILL = "standing still"
 """Name of the source of a gap in which the pose before it is held."""
 _PLANTED_HEIGHT = 0.025  # metres above the lowest toe
 _LIVELY = 0.5
-"""Path of the joints seen from the hips, over that of the tweener, from which on a long gap without keys in it is the
-network's all the same: walks it fills better, and outside its training data it hardly moves."""
+"""Path of the joints seen from the hips, over that of the tweener, from which on a long gap is the network's all the
+same: walks it fills better, and outside its training data it hardly moves."""
 _STYLED = 60  # frames of the shortest gap that is a tweener's that was given a style: in less there is no room for one
 _HELD = 46  # frames of the shortest gap in which a pose is held
 _ASTRAY = 0.03  # metres over the ground from which on standing hips are astray, and the pose is held
@@ -560,7 +560,7 @@ class AutoInbetweener(Inbetweener):
 
 def _stays_networks(query: GapQuery, answer: Proposal, tweened: Proposal, gap: tuple[int, int]) -> bool:
     """Return whether a gap stays the network's: it fills the whole of it, and the body moves there."""
-    by = {source.by for source in answer.attribute(query) if (source.start, source.stop) == gap}
+    by = {one.by for one in answer.attribute(query) if gap[0] <= one.start and one.stop <= gap[1]}
     if INTERPOLATION in by:
         return False
     path, other = (measure_path_length(one.motion.slice(gap[0] - 1, gap[1] + 1)) for one in (answer, tweened))

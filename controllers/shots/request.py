@@ -373,27 +373,27 @@ class ShotRequest:
         looks = tuple(replace(key, position=lower(key.position, key.seconds)) for key in self.looks)
         return replace(self, reaches=reaches, looks=looks)
 
-    def lower_clips(self, ground: Ground, rest_height: float) -> "ShotRequest":
+    def lower_clips(self, ground: Ground, rest_height: float, curve: Curve, end: float) -> "ShotRequest":
         """Return the request with its clips over a flat floor, with toe joints at a height (metres) at rest: those that
-        stand on the ground are lowered by as much. RequestError where the shot would leave or meet one on ground that
-        is not level."""
+        stand on the ground are lowered by as much. RequestError where the shot, which ends at an arc (metres) of a
+        curve, would leave or meet one on ground that is not level."""
 
-        def lower(motion: Motion, seam: int) -> Motion:
-            toes = motion.joint_positions()[seam, list(CANONICAL.indices(TOES))]
-            low, high = ground.height(toes[:, ::2]).aminmax()
+        def lower(motion: Motion, moved: Motion, seam: int) -> Motion:
+            toes, there = (each.joint_positions()[seam, list(CANONICAL.indices(TOES))] for each in (motion, moved))
+            low, high = ground.height(there[:, ::2]).aminmax()
             if float(high - low) > _LEVEL:
                 raise RequestError(
                     f"a clip's feet are over ground that differs by {100 * float(high - low):.0f} cm where the shot"
                     " begins or ends in it; choose a frame over level ground"
                 )
-            over = toes[:, 1].amin() - rest_height
+            over, low = toes[:, 1].amin() - rest_height, ground.height(toes[:, ::2]).amin()
             return lower_by(motion, torch.where((over - low).abs() < over.abs(), low, 0.0).expand(motion.num_frames))
 
         lead, arrival = self.lead, self.arrival
         return replace(
             self,
-            lead=None if lead is None else Lead(lower(lead.motion, -1)),
-            arrival=None if arrival is None else Arrival(lower(arrival.motion, 0)),
+            lead=lead and Lead(lower(lead.motion, lead.motion, -1)),
+            arrival=arrival and Arrival(lower(arrival.motion, arrival.bring_to(curve, end).motion, 0)),
         )
 
     def _check_obstacles(self) -> None:

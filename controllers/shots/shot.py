@@ -103,13 +103,14 @@ def solve_shot(
     began, settings = time.perf_counter(), settings or FollowSettings()
     character = Character(skeleton, settings.footing.rest_height)
     limits = character.data_limits(prior.limits)
-    if request.ground is not None:
-        request = request.lower_clips(request.ground, character.toe_rest_height)
     stairs, planned = Stairs.find(request.curve, request.ground), request
     if stairs.treads and not isinstance(request.speed, TimedSpeed):
         speed = stairs.slow(request.speed or walk_at_ease(request.curve), request.curve, limits.slowest)
         planned = replace(request, speed=speed)
     trajectory = plan_trajectory(planned)
+    if request.ground is not None:
+        end = float(trajectory.arcs[-1])
+        request = request.lower_clips(request.ground, character.toe_rest_height, trajectory.curve, end)
     rest = build_rest_pose(prior, skeleton, character.toe_rest_height)
     level = request if request.ground is None else request.lower_targets(_find_rise(request.ground, trajectory))
     poses = tuple(key for key in request.poses if not key.joints)

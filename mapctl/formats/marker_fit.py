@@ -114,7 +114,8 @@ def fit(
         body = _measure_body(body, first, some, shown, *pose)
         pose = _solve_poses(body, some, trust[frames], *pose, outlier=_OUTLIER, steps=_STEPS // 2)
     body = _measure_body(body, first, some, shown, *pose)
-    near = pose[1][(torch.arange(len(positions))[:, None] - frames).abs().argmin(dim=1)]
+    between = (frames[1:] + frames[:-1]).double() / 2
+    near = pose[1][torch.searchsorted(between, torch.arange(len(positions)).double())]
     chunks = zip(positions.split(_CHUNK), trust.split(_CHUNK), near.split(_CHUNK), strict=True)
     solved = [_find_poses(body, *chunk) for chunk in chunks]
     root, local = (torch.cat(values) for values in zip(*solved, strict=True))

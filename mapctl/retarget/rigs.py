@@ -141,7 +141,11 @@ class _RigFile(_RigSettings):
         names = {joint: own for joint, own in given.items() if joint not in parts}
         for side, words in sides.items():
             for part in parts:
-                names[side + part] = tuple(_spell(own, words, version) for version, own in enumerate(given[part]))
+                spelled = tuple(_spell(own, words, version) for version, own in enumerate(given[part]))
+                names.setdefault(side + part, spelled)
+        for part in parts:
+            if names["left" + part] == names["right" + part]:
+                raise RequestError(f"joints: {part} is one joint on both sides; give left, right and * in its name")
         settings = {item.name: getattr(self, item.name) for item in fields(_RigSettings)}
         settings["also"] = tuple({_spell(own, words, 0): None for own in self.also for words in sides.values()})
         return Rig(

@@ -186,6 +186,14 @@ def test_a_motion_passes_a_key_between_two_moments_without_a_jolt(fps, key):
     assert torch.allclose(found[key - 6 : key + 6], wanted[key - 6 : key + 6], rtol=0.1)
 
 
+@pytest.mark.parametrize("fps", [12, 15, 24, 30, 60, 120])
+def test_a_note_names_the_frames_of_a_gap(fps):
+    motion = walk(60, fps=fps)
+    missing = MissingMask.of_frames((torch.arange(60) >= 11) & (torch.arange(60) < 31), motion.num_joints)
+    (note,) = fill(motion, missing, LinearInbetweener(), refinement=None).gap_notes
+    assert note.startswith("frames 11:31: ")
+
+
 def test_a_place_is_known_only_with_all_that_carries_it():
     motion = walk(30)
     _, rigmap = retarget.to_canonical(motion)

@@ -224,9 +224,9 @@ def test_loops_and_clips_over_edges_are_refused_on_a_ground(walked, path):
         ShotRequest(curves.circle(radius=3), loop=True, ground=ground)
     heights = ground.height(walked.motion.joint_positions()[:, list(CANONICAL.indices(TOES)), ::2].double())
     lead = Lead.of(walked.motion, int(heights.diff(dim=1).abs()[:, 0].argmax()))
-    request = ShotRequest(lead.bring_curve(curves.line(length=1)), lead=lead, ground=ground)
+    curve = lead.bring_curve(curves.line(length=1))
     with pytest.raises(RequestError, match="level ground"):
-        request.lower_clips(ground, TOE_REST_HEIGHT)
+        ShotRequest(curve, lead=lead, ground=ground).lower_clips(ground, TOE_REST_HEIGHT, curve, 1.0)
 
 
 def test_stairs_may_begin_with_the_walk(tmp_path):

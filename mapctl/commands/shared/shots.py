@@ -36,6 +36,7 @@ from mapctl.motion import Motion
 from mapctl.problem.solution import Outcome
 from mapctl.recording.fusion import resample_by_splines
 from mapctl.retarget.carry import RiggedCharacter, retarget_motion
+from mapctl.retarget.legs import lower_by
 from mapctl.runtime.stepwise import Progress
 from priors.lstm_gmm.density import LstmGmmDensity
 from scenes.drawn_character import DrawnCharacter
@@ -186,17 +187,25 @@ def resample_shot(solution: ShotSolution, request: ShotRequest, fps: Fraction) -
     motion, before, after = solution.motion, None, None
     frames = int((motion.num_frames - 1) * fps / motion.fps) + 1
     if request.lead is not None:
-        before = request.lead.past
+        before = Lead(_raise_to_shot(request.lead.motion, -1, motion, 0, request)).past
     if request.loop:
         frames, after = round(motion.num_frames * fps / motion.fps) or frames, motion.slice(0, _BESIDE)
     elif request.arrival is not None:
         arrival = request.arrival.bring_to(solution.trajectory.curve, float(solution.trajectory.arcs[-1])).motion
+        arrival = _raise_to_shot(arrival, 0, motion, -1, request)
         after = arrival.slice(1, min(arrival.num_frames, 1 + _BESIDE))
     if fps <= motion.fps:
         return _join([motion, after]).resample(fps).slice(0, frames)
     whole, first = _join([before, motion, after]), 0 if before is None else before.num_frames
     seconds = (torch.arange(whole.num_frames, dtype=torch.float64) - first) / float(motion.fps)
     return resample_by_splines(whole, seconds, fps=fps, frames=frames)
+
+
+def _raise_to_shot(clip: Motion, frame: int, motion: Motion, at: int, request: ShotRequest) -> Motion:
+    """Raise a clip, on ground, until its hips in one frame are as high as those of a shot's motion in another."""
+    if request.ground is None:
+        return clip
+    return lower_by(clip, (clip.root_position[frame, 1] - motion.root_position[at, 1]).expand(clip.num_frames))
 
 
 def _join(parts: list[Motion | None]) -> Motion:
