@@ -386,8 +386,8 @@ class ShotRequest:
                     f"a clip's feet are over ground that differs by {100 * float(high - low):.0f} cm where the shot"
                     " begins or ends in it; choose a frame over level ground"
                 )
-            over, low = toes[:, 1].amin() - rest_height, ground.height(toes[:, ::2]).amin()
-            return lower_by(motion, torch.where((over - low).abs() < over.abs(), low, 0.0).expand(motion.num_frames))
+            own, over = ground.height(toes[:, ::2]).amin(), toes[:, 1].amin() - rest_height
+            return lower_by(motion, torch.where((over - own).abs() < over.abs(), own, 0.0).expand(motion.num_frames))
 
         lead, arrival = self.lead, self.arrival
         return replace(

@@ -112,10 +112,10 @@ def solve_shot(
         end = float(trajectory.arcs[-1])
         request = request.lower_clips(request.ground, character.toe_rest_height, trajectory.curve, end)
     rest = build_rest_pose(prior, skeleton, character.toe_rest_height)
-    level = request if request.ground is None else request.lower_targets(_find_rise(request.ground, trajectory))
-    poses = tuple(key for key in request.poses if not key.joints)
+    rise = _find_rise(request.ground, trajectory)
+    level, poses = request.lower_targets(rise), tuple(key for key in request.poses if not key.joints)
     level = replace(level, reaches=(*level.reaches, *as_reaches(request.poses, trajectory, rest)), poses=poses)
-    request = level if request.ground is None else level.lower_targets(-_find_rise(request.ground, trajectory))
+    request = level.lower_targets(-rise)
     check_reaches(level.reaches, trajectory, rest)
     trajectory = bend_toward_keys(trajectory, level, rest)
     if slows_in_corners(request, trajectory.curve):
@@ -150,9 +150,9 @@ def solve_shot(
         stepped = step_onto_ground(flat, request.ground, character.toe_rest_height, keys=fixed)
         motion = _meet_clips(stepped, torch.tensor(ends)) if ends else stepped.motion
     if inbetweener is not None:  # which knows motion over a floor alone
-        rise = (motion.root_position - flat.root_position)[:, 1]
-        level, settled = _meet_targets(lower_by(motion, rise), request.lower_targets(rise), posed, inbetweener)
-        motion = lower_by(level, -rise)
+        raised = (motion.root_position - flat.root_position)[:, 1]
+        lowered, settled = _meet_targets(lower_by(motion, raised), request.lower_targets(raised), posed, inbetweener)
+        motion = lower_by(lowered, -raised)
         reaches = tuple(replace(key, seconds=one.seconds) for key, one in zip(request.reaches, settled, strict=True))
     flat = motion if stepped is None else flat
     notes = [trajectory.note] if trajectory.note else []
@@ -184,8 +184,13 @@ def solve_shot(
     )
 
 
-def _find_rise(ground: Ground, trajectory: Trajectory) -> Float[Tensor, " frames"]:
-    return ground.height(trajectory.curve.ground_point(trajectory.arcs))
+def _find_rise(ground: Ground | None, trajectory: Trajectory) -> Float[Tensor, " frames"]:
+    """Find how high the ground is along a trajectory, metres."""
+    return (
+        torch.zeros(len(trajectory.arcs))
+        if ground is None
+        else ground.height(trajectory.curve.ground_point(trajectory.arcs))
+    )
 
 
 def _finish_ends(
