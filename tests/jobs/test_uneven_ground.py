@@ -190,6 +190,15 @@ def test_poses_and_footsteps_are_met_on_the_ground(walked, path):
     assert done.footing.penetration < 0.01
 
 
+def test_a_foothold_of_a_fixed_frame_stays(walk_motion, path):
+    ground = Ground.read(path)
+    moved = max(step_onto_ground(walk_motion, ground, TOE_REST_HEIGHT).holds, key=lambda hold: float(hold.moved.norm()))
+    assert float(moved.moved.norm()) > 0.02
+    fixed = step_onto_ground(walk_motion, ground, TOE_REST_HEIGHT, keys=[moved.start]).holds
+    same = next(hold for hold in fixed if (hold.foot, hold.start) == (moved.foot, moved.start))
+    assert float(same.moved.norm()) < 1e-9
+
+
 def find_level_frame(motion, ground, first):
     """The first frame from one on with both toes over ground of one height."""
     heights = ground.height(motion.joint_positions()[first:, list(CANONICAL.indices(TOES)), ::2].double())
